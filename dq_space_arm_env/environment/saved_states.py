@@ -55,7 +55,7 @@ def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array], steps
     Raises:
         ValueError: If the state is no mapping, an array is missing, has another shape or type, or numbers
             that are not finite, or the memory counts a number of steps that an episode of so many does not
-            have.
+            have, or goes on after.
     """
     if not isinstance(state, Mapping):
         raise ValueError(f"state: {shortened(state)}, should be what get_state() returns")
@@ -73,6 +73,8 @@ def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array], steps
     taken = found.get("memory", np.zeros(1))[..., 0]
     if not ((taken >= 0.0) & (taken <= steps) & (taken % 1.0 == 0.0)).all():
         raise ValueError(f"state: memory counts {taken} steps, should be whole numbers up to {steps}")
+    if not np.all(found.get("over", True) | (taken < steps)):
+        raise ValueError(f"state: memory counts {taken} steps; after {steps} an episode is over")
     for name, array in found.items():
         # A payload that the tip has not let go is adrift since NaN.
         if name != "adrift" and array.dtype.kind == "f" and not np.isfinite(array).all():

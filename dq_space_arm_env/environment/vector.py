@@ -104,7 +104,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
                 "episodes off, vectorization_mode='sync'"
             )
         picture = width, height, default_camera_config
-        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ValueError(f"num_envs: {num_envs!r}, should be a whole number of at least 1")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(
@@ -240,6 +240,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             raise ValueError(f"seed: {seed!r}, should be a whole number, or one for each sub-environment")
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed: {len(seeds)} seeds, should be {self.num_envs}, one per sub-environment")
+        for each in seeds:
+            if each is not None and not (isinstance(each, int | np.integer) and each >= 0):
+                raise ValueError(f"seed: {shortened(each)}, should be a whole number of at least 0, or None")
         if not self._begun:
             self._envs.seed(np.arange(self.num_envs), seeds)
             self._begun = True
@@ -435,6 +438,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             raise ValueError(
                 f"rows: {shortened(rows)}, should be numbers below {self.num_envs}, or a mask"
             ) from error
+        if chosen.ndim > 1:
+            raise ValueError(f"rows: {shortened(rows)}, should be a list of numbers, or a mask")
         if len(np.unique(chosen)) < len(chosen):
             raise ValueError(f"rows: {shortened(rows)} has a sub-environment twice")
         return chosen

@@ -213,13 +213,16 @@ def test_bad_states_are_refused_and_change_nothing():
                 ValueError, match=r"state: memory counts .* steps, should be whole numbers up to"
             ):
                 each.set_state({**state, "memory": counted})
+        counted[..., 0] = each.scene.simulation.steps
+        with pytest.raises(ValueError, match=r"state: memory counts .* steps; after \d+ an episode is over"):
+            each.set_state({**state, "memory": counted})
         for name in ("x", "memory", "parameters"):
             bad = state[name].copy()
             bad[..., -1] = np.nan
             with pytest.raises(ValueError, match=f"(?s)state: {name} .*should be finite numbers"):
                 each.set_state({**state, name: bad})
         assert_same(each.get_state(), state)
-    for rows in ([3], [0, 0], [[True]], "x"):
+    for rows in ([3], [0, 0], [[True]], "x", True, [[0, 1]]):
         with pytest.raises(ValueError, match="rows: "):
             venv.get_state(rows)
     env.np_random = np.random.Generator(np.random.MT19937(0))

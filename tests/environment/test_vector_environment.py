@@ -230,6 +230,10 @@ def test_what_a_caller_does_to_results_does_not_matter():
         (lambda v: v.step(np.zeros((3, 12))), r"shape \(3, 12\), should be \(4, 12\)"),
         (lambda v: v.reset(seed=[1, 2]), "2 seeds, should be 4"),
         (lambda v: v.reset(seed=1.5), "seed: 1.5, should be a whole number, or one for each"),
+        (lambda v: v.reset(seed=-2), "seed: -2, should be a whole number of at least 0"),
+        (lambda v: v.reset(seed=[0, None, 2.5, 3]), "seed: 2.5, should be a whole number of at least 0"),
+        (lambda v: v.reset(seed=[[0], [1], [2], [3]]), r"seed: \[0\], should be a whole number"),
+        (lambda v: v.reset(seed="0123"), "seed: '0', should be a whole number of at least 0"),
         (lambda v: v.reset(options={"reset_mask": np.zeros(4, dtype=bool)}), "False everywhere"),
         (lambda v: v.reset(options={"reset_mask": [True] * 4}), "should be a bool array"),
         (lambda v: v.reset(options={"nominel": True}), r"\['nominel'\] unknown; choose from nominal"),
@@ -271,6 +275,8 @@ def test_who_is_pushed_and_not_reset_shows_where_it_is(mode):
 
 
 def test_bad_construction_is_refused():
+    with pytest.raises(ValueError, match="num_envs: True, should be a whole number of at least 1"):
+        DQSpaceArmVectorEnv(True)
     for number in (0, 1.5):
         with pytest.raises(ValueError, match=f"num_envs: {number}, should be a whole number of at least 1"):
             DQSpaceArmVectorEnv(number)
