@@ -89,7 +89,8 @@ def _replace(
     except OSError as error:  # nobody knows the temporary name, and a full disk names no file
         raise OSError(error.errno, error.strerror or str(error), os.fspath(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # where it could not be made, it cannot be removed
+            temporary.unlink()
     if durable and os.name != "nt":  # Windows opens no folders
         _flush(path.parent)
 

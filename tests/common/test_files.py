@@ -50,6 +50,13 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [file]
 
 
+@pytest.mark.parametrize("name", ["file/a.txt", "missing/a.txt", "a" * 240, "a" * 300])
+def test_what_cannot_be_written_is_named_by_its_own_name(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=f": '{tmp_path / name}'$"):
+        write_atomically(tmp_path / name, "new")
+
+
 @pytest.mark.parametrize("call", ["write", "fsync", "replace"])
 def test_a_failure_at_any_moment_leaves_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
