@@ -31,7 +31,9 @@ def read_demonstration(source: str, label: str | None) -> Trajectory | None:
     controls = layout.to_control(demonstration.actions, stages[:-1])
     if layout.parameters.move_target:
         parameters = stages
-    flight = Trajectory(label or f"demonstration {number}", np.array(demonstration.states), controls)
+    flight = Trajectory(
+        label or f"demonstration {number}", np.array(demonstration.states), controls, seed=demonstration.seed
+    )
     if layout.n_p:
         flight = replace(flight, target=layout.target_with(parameters))
     if layout.n_p and has_grasp(scene):

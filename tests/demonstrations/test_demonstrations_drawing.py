@@ -16,9 +16,11 @@ from demonstration_files import (
     shard_files,
     solved_problems,
 )
+from rich.console import Console
 
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.command_line.replaying import collect_flights
 from experts import BoxDDP, StopReason, generate_demonstrations, load_demonstrations
 from experts.command_line.recorded_demonstrations import read_demonstration
 from experts.demonstrations import Demonstrations, DemonstrationsError, SerialExecutor
@@ -238,6 +240,14 @@ def test_a_replayed_demonstration_shows_its_own_target(drawn: Demonstrations):
     env.reset(seed=drawn[4].seed)
     np.testing.assert_array_equal(flight.target, env.unwrapped.target)
     assert not np.allclose(flight.target, drawn.kernels.layout.target, atol=1e-3)
+
+    # Policies beside it fly with the target and the masses of the demonstration.
+    sources = [(None, f"{drawn.path}#4"), (None, "zero")]
+    [((_, policy), _)] = collect_flights(sources, None, Console(quiet=True))
+    np.testing.assert_array_equal(policy.target, flight.target)
+    np.testing.assert_array_equal(policy.states[0], flight.states[0])
+    env.step(np.zeros(6))
+    np.testing.assert_allclose(policy.states[1], env.unwrapped.state, rtol=0, atol=1e-14)
 
 
 def test_minari_has_the_parameters_in_every_row_and_gives_them_back(
