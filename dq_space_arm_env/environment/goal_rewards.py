@@ -100,13 +100,12 @@ class ComputesRewards:
         """
         comparison, diverged = self._goals.compare(achieved_goal, desired_goal), _diverged(info)
         _check_poses(comparison, achieved_goal=achieved_goal, desired_goal=desired_goal)
-        try:
-            rewards = self._goals.of(comparison, diverged)
-        except ValueError:
+        if np.shape(diverged) not in ((), comparison.pose_cost.shape):
             shapes = (
                 f"{np.shape(diverged)}, should be one dictionary or of shape {comparison.pose_cost.shape}"
             )
-            raise ValueError(f"info: of shape {shapes}, as the goals are") from None
+            raise ValueError(f"info: of shape {shapes}, as the goals are")
+        rewards = self._goals.of(comparison, diverged)
         return rewards if rewards.ndim else float(rewards)
 
 

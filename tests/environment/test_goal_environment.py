@@ -241,6 +241,9 @@ def test_goals_alone_and_in_batches():
     assert env.compute_reward(achieved[:0], desired[:0], []).shape == (0,)
     grid = env.compute_reward(achieved[:6].reshape(2, 3, 8), desired[:6].reshape(2, 3, 8), None)
     np.testing.assert_array_equal(grid, rewards[:6].reshape(2, 3))
+    for infos, goals in (([{}], achieved), ([{}] * 2, achieved[0]), ({"diverged": [True] * 2}, achieved[:1])):
+        with pytest.raises(ValueError, match=r"info: of shape .*, should be one dictionary or of shape"):
+            env.compute_reward(goals, goals, infos)
     with pytest.raises(ValueError, match="reward_type: 'dens' is unknown; choose from sparse and dense"):
         DQSpaceArmGoalEnv(reward_type="dens")
     with pytest.raises(ValueError, match=r"goals: shapes \(7, 8\) and \(7,\), should be \(8,\) or \(B, 8\)"):
