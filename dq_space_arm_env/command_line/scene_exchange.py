@@ -140,6 +140,8 @@ def _spread(scene: Scene, width: float) -> dict[str, float]:
 def mounted(position: tuple[float, ...] | None, degrees: tuple[float, ...] | None) -> dict[str, Any]:
     """Pose of the base link on the spacecraft; `degrees` are roll, pitch and yaw."""
     roll, pitch, yaw = (math.radians(angle) for angle in degrees or (0.0, 0.0, 0.0))
+    if not math.isfinite(roll + pitch + yaw):
+        raise ValueError(f"--mount-rotation is {degrees}, should be 3 finite numbers, degrees")
     return {"position": position or (0.0, 0.0, 0.0), "rotation": rotations.from_euler_321(yaw, pitch, roll)}
 
 

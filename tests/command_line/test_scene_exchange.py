@@ -255,6 +255,10 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
         ([*HAND, *CARRIED, "--passive", "j"], "--passive: 'j' is not .* shoulder, elbow"),
         ([*HAND, "--mount", "0", "0", "1"], "--mount places the arm on a spacecraft: give --spacecraft-mass"),
         (
+            [*HAND, *CARRIED, "--mount-rotation", "inf", "0", "0"],
+            r"--mount-rotation is \(inf, 0.0, 0.0\), should be 3 finite numbers, degrees",
+        ),
+        (
             [*HAND, *CARRIED, "--wheels", "pyramid", "--base-torque", "3"],
             "--base-torque limits ideal wheels, and those of --wheels pyramid are in size for the base",
         ),
