@@ -399,12 +399,17 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         if not self._begun and len(chosen) < self.num_envs:
             raise ResetNeeded("the other episodes have not begun: call reset() before set_state() of some")
         kept = self._kept()
+        observes = isinstance(state, Mapping) and "seen" in kept and "seen" not in state
+        if observes:  # environments that reset themselves do not keep what they have shown
+            del kept["seen"]
         expected = {name: array[chosen] for name, array in kept.items()}
         found = checked_state(state, expected, self.scene.simulation.steps)
         self._begin_trails(chosen)
         for name, array in kept.items():
             array[chosen] = found[name]
         self._begun, self._over = True, np.flatnonzero(kept["over"])
+        if observes and self._seen is not None:
+            self._seen[chosen] = self.observe()[chosen]
         self._extend_trails()
 
     def _kept(self) -> dict[str, Array]:
@@ -423,8 +428,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
                 name: np.broadcast_to(array, (self.num_envs, *np.shape(array)))
                 for name, array in state.items()
             }
-        seen = {} if self._seen is None else {"seen": self._seen}  # what follows observes anew
-        arrays = {name: np.asarray(array) for name, array in {**state, **seen}.items()}
+        arrays = {name: np.asarray(array) for name, array in state.items()}
         return {
             name: array[rows] if array.shape[:1] == (self.num_envs,) else array
             for name, array in arrays.items()

@@ -171,6 +171,18 @@ def test_rows_are_saved_and_put_back(mode, rows):
     assert (other.states[1] != whole["x"][1]).any()
 
 
+@pytest.mark.parametrize("mode", MODES[:2])
+def test_environments_that_reset_themselves_hand_over_to_one_that_does_not(mode):
+    venv, other = DQSpaceArmVectorEnv(3, DRAWN, mode), DQSpaceArmVectorEnv(3, DRAWN, "Disabled")
+    venv.reset(seed=0)
+    shown = venv.step(actions((3, 12)))[0]
+    other.set_state(venv.get_state())
+    observations, _ = other.reset(options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal(observations[[0, 2]], shown[[0, 2]])
+    move = actions((3, 12), 1)
+    np.testing.assert_array_equal(other.step(move)[1][[0, 2]], venv.step(move)[1][[0, 2]])
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_an_episode_that_is_over_stays_so(mode):
     venv, other = (DQSpaceArmVectorEnv(2, DRAWN, mode) for _ in range(2))
@@ -192,7 +204,8 @@ def test_bad_states_are_refused_and_change_nothing():
         each.reset(seed=0)
         state = each.get_state()
         for name, array in state.items():
-            wrong = [{}, {name: np.zeros((7, 7))}, {name: array.astype(np.complex128)}]
+            wrong = [{name: np.zeros((7, 7))}, {name: array.astype(np.complex128)}]
+            wrong += [{}] if name != "seen" else []
             for change in wrong:
                 rest = {key: value for key, value in state.items() if key != name}
                 with pytest.raises(ValueError, match=f"state: {name} "):
