@@ -94,8 +94,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         Raises:
             SceneError: If the scene cannot be loaded.
             ValueError: If num_envs or threads is not positive, the scene has no normalized actions, the
-                render mode is unknown, size or camera of the pictures is invalid, or `max_episode_steps` is
-                given.
+                autoreset mode or the render mode is unknown, size or camera of the pictures is invalid, or
+                `max_episode_steps` is given.
         """
         if max_episode_steps not in (None, -1):
             raise ValueError(
@@ -111,6 +111,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
                 f"render_mode: {render_mode!r}; a vector environment has no window, "
                 "should be 'rgb_array' or None"
             )
+        modes = [mode.value for mode in AutoresetMode]
+        if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
+            raise ValueError(f"autoreset_mode: {autoreset_mode!r}, should be one of {', '.join(modes)}")
         self._picture = PictureFormat.checked(*picture)
         single = self._make_single(scene)
         self.scene, self.kernels = single.scene, compile_scene(single.scene, threads)

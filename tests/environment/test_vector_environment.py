@@ -282,6 +282,9 @@ def test_bad_construction_is_refused():
             DQSpaceArmVectorEnv(number)
         with pytest.raises(ValueError, match=f"threads: {number}, should be a whole number of at least 1"):
             DQSpaceArmVectorEnv(2, threads=number)
+    for mode in ("NEXT_STEP", None):
+        with pytest.raises(ValueError, match=f"autoreset_mode: {mode!r}, should be one of NextStep"):
+            DQSpaceArmVectorEnv(2, autoreset_mode=mode)
     with pytest.raises(ValueError, match="render_mode: 'human'"):
         DQSpaceArmVectorEnv(2, render_mode="human")
     with pytest.raises(ResetNeeded):
