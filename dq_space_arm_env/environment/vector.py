@@ -246,6 +246,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         for each in seeds:
             if each is not None and not (isinstance(each, int | np.integer) and each >= 0):
                 raise ValueError(f"seed: {shortened(each)}, should be a whole number of at least 0, or None")
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))  # np_random, which nothing is drawn from here, and np_random_seed
         if not self._begun:
             self._envs.seed(np.arange(self.num_envs), seeds)
             self._begun = True

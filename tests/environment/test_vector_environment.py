@@ -264,6 +264,14 @@ def test_copies_that_a_first_reset_leaves_out_begin_at_the_next_step(mode):
     assert not over.any()
 
 
+def test_the_seed_is_that_of_gymnasiums_own_generator_too():
+    venv, twin = (DQSpaceArmVectorEnv(2, short()) for _ in range(2))
+    for each in (venv, twin):
+        each.reset(seed=7)
+        assert each.np_random_seed == 7
+    assert venv.np_random.random() == twin.np_random.random()
+
+
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_who_is_pushed_and_not_reset_shows_where_it_is(mode):
     venv = DQSpaceArmVectorEnv(2, short(), mode)
