@@ -70,7 +70,8 @@ def replay(
     sources = [_labeled(flight) for flight in flights]
     for place, label in enumerate(labels):
         sources[place] = label, sources[place][1]
-    if out.resolve() in [Path(source).resolve() for _, source in sources]:
+    files = [Path(source, name).resolve() for _, source in sources for name in ("", "solution.npz")]
+    if out.resolve() in files:
         raise ValueError(f"--out: {out} is one of the flights, which it would replace: name another file")
     (shown, robot), *others = collect_flights(
         sources,

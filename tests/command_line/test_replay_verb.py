@@ -109,6 +109,11 @@ def test_unusable_input_is_one_sentence(
 
 
 def test_a_page_does_not_replace_a_flight(rollout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    solution = rollout.with_name("solution.npz")
+    solution.write_bytes(rollout.read_bytes())
+    assert main(["replay", str(rollout.parent), "--out", str(solution)]) == 2
+    assert "is one of the flights" in " ".join(capsys.readouterr().err.split())
+    assert solution.read_bytes() == rollout.read_bytes()
     content = rollout.read_bytes()
     other = f"{rollout.parent}/../{rollout.parent.name}/{rollout.name}"
     assert main(["replay", str(rollout), "--out", other]) == 2
