@@ -138,9 +138,9 @@ def with_loads(
     """
     factors = np.asarray(factors, dtype=np.float64)
     names = [number.name for number in load_numbers(scene)]
-    staged = scene.staged.values if scene.phases else {}
-    if (factors != 1.0).any() and (not names or names[0] in staged):
-        reason = f"phases that change {names[0]}" if names else "neither payload nor links"
+    changed = [name for name in names if scene.phases and name in scene.staged.values]
+    if (factors != 1.0).any() and (not names or changed):
+        reason = f"phases that change {changed[0]}" if names else "neither payload nor links"
         raise ValueError(f"scene {scene.name!r} has {reason}: mass_factors should be 1 alone")
     flown, known = scene.replace(parameters=[*scene.parameters, *names]), StateLayout.of(scene).parameters
     varying = StateLayout.of(flown).parameters

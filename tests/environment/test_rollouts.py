@@ -178,6 +178,13 @@ def test_a_base_alone_has_no_mass_to_change(scene):
     assert with_loads(bare, [1.0])[0] == bare
 
 
+def test_an_inertia_that_phases_change_is_not_multiplied(scene):
+    changes = {"links.2.inertia": [0.02, 0.9, 0.9]}
+    phases = [{"name": "stowed", "steps": 10}, {"name": "unfolded", "steps": 15, "changes": changes}]
+    with pytest.raises(ValueError, match=r"has phases that change links.2.inertia.zz: mass_factors should"):
+        with_loads(scene.replace(phases=phases), [2.0])
+
+
 def test_disturbances_are_those_of_all_episodes(scene):
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="those of 1 episodes, should be of 3: make them with count=3"):
