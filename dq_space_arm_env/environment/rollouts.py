@@ -186,7 +186,7 @@ def rollout(
     if seeds is not None and starts is not None:
         raise ValueError("seeds and starts exclude each other")
     if not isinstance(delay, int | np.integer) or delay < 0:
-        raise ValueError(f"delay: {delay}, should be a whole number of at least 0 steps")
+        raise ValueError(f"delay: {delay}, should be at least 0 steps, a whole number")
     if not all(isinstance(seed, int | np.integer) for seed in (() if seeds is None else seeds)):
         raise ValueError(f"seeds: {shortened(seeds)}, should be whole numbers")
     if steps is None:

@@ -207,7 +207,7 @@ def test_a_rollout_takes_a_step_at_least(scene, steps):
         ({"seeds": [1.5]}, r"seeds: \[1.5\], should be whole numbers"),
         ({"starts": np.zeros(14)}, r"starts: shape \(14,\), should be \(B, n_x\)"),
         ({"starts": np.zeros((0, 14))}, "starts: none, should be one for each episode"),
-        ({"delay": 1.5}, "delay: 1.5, should be a whole number of at least 0 steps"),
+        ({"delay": 1.5}, "delay: 1.5, should be at least 0 steps, a whole number"),
     ],
 )
 def test_episodes_are_counted_by_seeds_or_rows_of_starts(scene, given, message):
