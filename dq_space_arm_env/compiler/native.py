@@ -1,7 +1,7 @@
 """Machine code: compile for this processor, cache the object file, load it without compiling.
 
 An object file is cached under the hash of everything it depends on: the program's content, the compiler's and
-the model's source, the version of LLVM, and the processor.
+the model's source, the versions of CasADi and LLVM, and the processor.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -213,13 +214,13 @@ def matrices(entries: Array, rows: int, columns: int) -> Array:
 
 @cache
 def source_hash() -> str:
-    """Hash of the source that kernels are made from: a changed model never meets an old kernel.
+    """Hash of what traces kernels, source and CasADi: a changed model never meets an old kernel.
 
     Returns:
         A hexadecimal number.
     """
     package = Path(__file__).parent.parent
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(version("casadi").encode())
     for path in sorted(package.rglob("*.py")):
         if path.relative_to(package).parts[0] in _MODEL_SOURCES:
             digest.update(path.read_bytes())

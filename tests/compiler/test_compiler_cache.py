@@ -17,6 +17,7 @@ from dq_space_arm_env.compiler import native
 from dq_space_arm_env.compiler.build import build_program
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.kernels import library
 
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX permissions and files")
 
@@ -260,6 +261,12 @@ def test_a_second_process_neither_traces_nor_compiles(cache):
 
 
 @pytest.mark.slow
+def test_code_of_another_casadi_is_not_taken(monkeypatch):
+    assert library.source_hash.__wrapped__() == library.source_hash()
+    monkeypatch.setattr(library, "version", lambda package: f"another {package}")
+    assert library.source_hash.__wrapped__() != library.source_hash()
+
+
 def test_a_first_use_says_that_it_compiles_and_where_the_result_is(cache):
     code = SECOND_PROCESS + "kernels.linearize(kernels.layout.initial_state, [0.0] * kernels.n_u)\n"
     first, second = (run_process(cache, code).stderr for _ in range(2))
