@@ -177,14 +177,10 @@ class _Learner:
     def _trial(self, environment: DQSpaceArmVectorEnv, inputs: Array) -> Array:
         """Observations (N, n_obs) under inputs (K, B, n_u), those of flights that have not diverged."""
         kernels, states, seen = environment.kernels, environment.states, []
-        given = environment.parameters if kernels.n_p else None
-        stages = None
-        if kernels.parameters.staged:
-            along = Starts.of(kernels, states, environment.parameters, self._times)
-            stages = along.at(np.arange(SEEN))
+        along = Starts.of(kernels, states, environment.parameters, self._times).at(np.arange(SEEN))
         for k, step in enumerate(np.diff(self._times)):
             left = np.full((SEEN, 1), self._times[-1] - self._times[k])
-            p = given if stages is None else stages[k]
+            p = along[k] if kernels.n_p else None
             seen.append(kernels.observation(states, left, p)[0])
             states = kernels.step(states, inputs[k], step, p=p)
         samples = np.concatenate(seen)
