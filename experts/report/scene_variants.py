@@ -16,6 +16,7 @@ _TIP_WRENCH = {"force": [0.2, 0.0, -0.1], "torque": [0.05, 0.0, 0.02]}
 _SPRING = {"stiffness": 10.0, "damping": 1.0}  # N m/rad, N m s/rad
 _RANDOM_TARGET = {"target_rotation": 0.1, "target_position": 0.1}  # rad, m
 _RANDOM_MASSES = ("mass", "inertia")
+_MASSES = ("base_mass", "base_inertia", "link_masses", "link_inertias", "payload_mass", "payload_inertia")
 _ACTUATORS = {
     "base_force": "base force",
     "base_torque": "base torque",
@@ -77,6 +78,7 @@ def _with_link_fields(scene: Scene, **fields: Any) -> Scene:
 def _changed(scene: Scene, **changes: Any) -> Scene:
     """Change a scene; of its phases, constraints and parameters keep those that still fit."""
     start = {**changes.pop("initial_state", {}), "previous_controls": ()}
+    changes["spread"] = _observable(scene, changes.pop("spread", {}))
     changed = scene.replace(phases=(), constraints=(), parameters=(), initial_state=start, **changes)
     for payload in (True, False):
         if scene.phases and not changed.phases:
@@ -117,19 +119,23 @@ def _with_actuator_fields(scene: Scene, **fields: Any) -> Scene | None:
 
 def _spread_variants(scene: Scene) -> dict[str, Scene]:
     """Without the starts, target and masses that episodes draw; with those that they do not."""
-    drawn = {name: width for name, width in scene.spread.model_dump().items() if width}
+    drawn = {name for name, width in scene.spread.model_dump().items() if width} - {"observed"}
     masses = [f"base_{name}" for name in _RANDOM_MASSES]
     if scene.links:
         masses += ["link_masses", "link_inertias"]
     if scene.payload:
         masses += [f"payload_{name}" for name in _RANDOM_MASSES]
     variants = {}
-    starts = drawn.keys() - {*masses, *_RANDOM_TARGET}
+    target = {name for name in drawn if name.startswith(("target_", "grasp_"))}
+    starts = drawn - {*masses, *target}
     if starts:
         variants["without random starts"] = _with_spread(scene, **dict.fromkeys(starts, 0.0))
-    for title, widths in (("random target", _RANDOM_TARGET), ("random masses", dict.fromkeys(masses, 0.1))):
-        if drawn.keys() & widths.keys():
-            variants[f"without {title}"] = _with_spread(scene, **dict.fromkeys(widths, 0.0))
+    for title, gone, widths in (
+        ("random target", target, _RANDOM_TARGET),
+        ("random masses", drawn & {*masses}, dict.fromkeys(masses, 0.1)),
+    ):
+        if gone:
+            variants[f"without {title}"] = _with_spread(scene, **dict.fromkeys(gone, 0.0))
         else:
             with suppress(SceneError):  # of what phases change, nothing is drawn
                 variants[f"with {title}"] = _with_spread(scene, **widths)
@@ -137,7 +143,13 @@ def _spread_variants(scene: Scene) -> dict[str, Scene]:
 
 
 def _with_spread(scene: Scene, **widths: float) -> Scene:
-    return scene.replace(spread=widths)
+    return scene.replace(spread=_observable(scene, widths))
+
+
+def _observable(scene: Scene, widths: dict[str, float]) -> dict[str, Any]:
+    """Changes of a spread; where no mass is drawn any more, none is observed."""
+    left = scene.spread.model_dump() | widths
+    return widths if any(left[name] for name in _MASSES) else {**widths, "observed": False}
 
 
 def without_actuators(scene: Scene, *names: str) -> Scene:

@@ -58,6 +58,26 @@ def test_parts_of_every_scene_make_scenes(name: str) -> None:
     assert len(feature_variants(load_scene(name))) > 10
 
 
+def test_masses_are_observed_where_some_are_drawn() -> None:
+    spread = {"observed": True, "link_masses": 0.1, "joint_angles": 0.1}
+    scene = load_scene("no-wrist").replace(spread=spread)
+    observed = {title: variant.spread.observed for title, variant in feature_variants(scene).items()}
+    assert not observed.pop("without random masses")
+    assert not observed.pop("with 0 links")
+    assert observed.pop("without random starts")
+    assert all(observed.values())
+
+
+def test_a_random_target_has_a_random_motion() -> None:
+    scene = load_scene("capture-and-detumble")
+    moved = {"target_angular_velocity", "target_linear_velocity", "target_rotation", "target_position"}
+    variants = feature_variants(scene)
+    for title, kept in (("without random starts", True), ("without random target", False)):
+        drawn = {name for name, width in variants[title].spread.model_dump().items() if width}
+        assert drawn & moved == (moved if kept else set())
+        assert ("joint_angles" in drawn) != kept
+
+
 def test_constraints_go_with_what_they_need_and_others_stay() -> None:
     clear = {"frame": "target", "radius": 0.1}
     rates = {"kind": "control_rate", "name": "rates", "base_force": 5.0, "joint_torque": 3.0}
