@@ -4,7 +4,8 @@ Three motions without inputs are pushed further and further, each in one quantit
 
 - step: a slow free motion of the scene, in longer and longer steps;
 - rate: the same directions, faster and faster, over as many radians, in the scene's steps;
-- stiffness: all joints but spherical ones on springs at rest, slightly deflected, in the scene's steps.
+- stiffness: all joints but spherical ones on springs at rest, slightly deflected, in the scene's steps; gears
+  are rigid and without friction, and wheels are at rest.
 
 In the first two, an integrator holds while the tip ends close to that of the method of order 8 with short
 steps. In the third, it holds while the vibration stays bounded. Without dampers, the only time constant of a
@@ -19,6 +20,7 @@ from collections.abc import Callable
 from functools import cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Column, Row
@@ -158,9 +160,22 @@ def _fast_motion(scene: Scene) -> Callable[[str, float], bool]:
 
 
 def on_springs(scene: Scene) -> Scene:
-    """The scene with each joint on a spring at rest, spherical ones aside, without dampers and wrench."""
+    """The scene with each joint on a spring at rest, spherical ones aside, without dampers and wrench.
+
+    Gears are rigid and without friction: no time constant remains but that of the springs.
+    """
     angles = dict(zip(freedoms(scene.links), scene.initial_state.joint_angles, strict=True))
-    links = [link.model_copy(update={"stiffness": 0.0, "damping": 0.0}) for link in scene.links]
+    rigid = {"friction": 0.0, "stiffness": None, "damping": 0.0}
+    links = [
+        link.model_copy(
+            update={
+                "stiffness": 0.0,
+                "damping": 0.0,
+                "motor": link.motor and link.motor.model_copy(update=rigid),
+            }
+        )
+        for link in scene.links
+    ]
     for (index, axis), angle in angles.items():
         if not axis:
             links[index] = links[index].model_copy(update={"stiffness": STIFFNESS, "rest_angle": angle})
@@ -173,12 +188,19 @@ def _sprung_coordinates(scene: Scene) -> list[int]:
     return [int(end) - 1 for link, end in zip(scene.links, ends, strict=True) if link.freedoms == 1]
 
 
+def _deflected(kernels: Kernels) -> tuple[FloatArray, NDArray[np.int64]]:
+    """The start at rest with its springs deflected, and the places of their joints in the state."""
+    x, where = _start(kernels, 0.0), kernels.layout.state
+    x[where.wheel_momenta] = 0.0
+    sprung = where.joint_angles.start + np.array(_sprung_coordinates(kernels.scene), np.int64)
+    x[sprung] += DEFLECTION * np.random.default_rng(0).uniform(0.5, 1.0, sprung.shape)
+    return x, sprung
+
+
 def _vibration(scene: Scene) -> Callable[[str, float], bool]:
     kernels, dt = compile_scene(on_springs(scene)), scene.simulation.dt
-    x = _start(kernels, 0.0)
-    sprung = kernels.layout.state.joint_angles.start + np.array(_sprung_coordinates(scene))
-    rest = x[sprung].copy()
-    x[sprung] += DEFLECTION * np.random.default_rng(0).uniform(0.5, 1.0, rest.shape)
+    x, sprung = _deflected(kernels)
+    rest = kernels.layout.initial_state[sprung]
 
     def holds(integrator: str, stiffness: float) -> bool:
         h = dt * math.sqrt(stiffness / STIFFNESS)

@@ -128,6 +128,23 @@ def test_spherical_joints_are_on_no_springs() -> None:
     assert not holds("rk4", 1e7)
 
 
+@pytest.mark.parametrize("name", ["motors", "elastic-joints", "wheels"])
+def test_swings_have_no_time_constant_but_that_of_the_springs(name: str) -> None:
+    """The search varies steps in place of stiffness: friction, elastic gears and wheels must be out of it."""
+    scene, ends = load_scene(name), []
+    if name == "wheels":
+        scene = scene.replace(initial_state={"wheel_speeds": [380.0] * 4})
+    sprung, dt = on_springs(scene), 0.05
+    for ratio in (1.0, 4.0):
+        links = [link.model_copy(update={"stiffness": ratio * link.stiffness}) for link in sprung.links]
+        kernels = compile_scene(sprung.replace(links=links))
+        x, joints = stability_envelope._deflected(kernels)
+        steps = kernels.simulate(x, np.zeros(kernels.n_u), 100, dt / math.sqrt(ratio), "rk4")
+        ends.append(steps[:, joints] - x[joints])
+    assert np.abs(ends[0]).max() > 0.5 * stability_envelope.DEFLECTION
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0.0, atol=1e-12)
+
+
 def test_higher_order_holds_longer_steps_and_slow_motions(short_scene: Scene, limits: Limits) -> None:
     """Without springs only rate times step counts; the steps of a motion are whole."""
     steps = [limits[name, "step"] for name in ("symplectic_euler", "rk4", "rk8")]
