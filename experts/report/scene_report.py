@@ -66,18 +66,16 @@ def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False)
         {**origin, "request": request},
         complaint="Not everything is measured",
     )
+    # All of them before the first file is written: an interrupt must not lose those that come later.
+    kept = {name: _kept_section(PARTS[name], name, scene, rows, console) for name, rows in found.items()}
+    sections = {name: section for name, section in kept.items() if section is not None}
     for name, part in PARTS.items():
-        section = None
-        if name in found:
-            section = _kept_section(part, name, scene, found[name], console)
-        if section is None:
-            found[name] = _measured(name, scene, effort, console)
-            section = _section(part, name, scene, found[name])
-        section.record = {**found[name], **section.record}
-        page.sections.append(section)
+        if name not in sections:
+            sections[name] = _section(part, name, scene, _measured(name, scene, effort, console))
+        page.sections = [sections[each] for each in PARTS if each in sections]
         files = page.save(folder, NAME)
-        console.print(section.title, style="bold", markup=False)
-        section.print(console)
+        console.print(sections[name].title, style="bold", markup=False)
+        sections[name].print(console)
     console.print(f"{folder}: {', '.join(files)}", markup=False)
     return page
 
@@ -104,9 +102,11 @@ def _measured(name: str, scene: Scene, effort: Effort, console: Console) -> dict
 def _section(part: ModuleType, name: str, scene: Scene, found: dict[str, Any]) -> Section:
     if "refused" in found:
         sentence = f"{name} is not measured: {found['refused']}"
-        return Section(name, name.capitalize(), "Not measured.", shortcomings=[sentence])
-    section: Section = part.section(scene, found)
-    section.name = name  # by which a resumed report finds its rows
+        section = Section(name, name.capitalize(), "Not measured.", shortcomings=[sentence])
+    else:
+        section = part.section(scene, found)
+        section.name = name  # by which a resumed report finds its rows
+    section.record = {**found, **section.record}
     return section
 
 

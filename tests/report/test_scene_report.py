@@ -299,6 +299,26 @@ def test_an_interrupted_report_keeps_its_parts_and_resumes(
     assert page.shortcomings == []
 
 
+def test_an_interrupted_resumption_keeps_the_parts_that_it_found(
+    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = {"first": MadeUpPart(), "second": MadeUpPart(), "third": MadeUpPart(interrupts=True)}
+    monkeypatch.setattr(scene_report, "PARTS", parts)
+    with pytest.raises(KeyboardInterrupt):
+        scene_report.report(short_scene, tmp_path, Console(), quick=True)
+
+    def interrupted(*given: object) -> Section:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(parts["second"], "section", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            scene_report.report(short_scene, tmp_path, Console(), quick=True)
+    page = scene_report.report(short_scene, tmp_path, Console(), quick=True)
+    assert [part.measured for part in parts.values()] == [1, 1, 2]
+    assert [section.name for section in page.sections] == list(parts)
+
+
 def test_a_part_that_refuses_the_scene_says_so(
     short_scene: Scene,
     tmp_path: Path,
