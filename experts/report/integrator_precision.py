@@ -220,11 +220,12 @@ def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
     )
     own = [row for row in points if row["integrator"] == scene.simulation.integrator]
     if own:
-        error = own[0]["error"]
+        error, tolerance = own[0]["error"], own[0]["tolerance"]
         ends = "loses the maneuver" if error is None else f"ends {error:.1e} m or rad off"
+        within = "" if tolerance is None else f" and a tolerance of {tolerance:g}"  # not the scene's
         made.notes.append(
             f"The scene's own integrator, {scene.simulation.integrator} with steps of "
-            f"{scene.simulation.dt:g} s, {ends}."
+            f"{scene.simulation.dt:g} s{within}, {ends}."
         )
 
     def draw() -> bytes:

@@ -57,8 +57,8 @@ class ManeuverRun:
 
     @property
     def replay_difference(self) -> float:
-        """Relative difference between the costs of the replay and of the solver."""
-        return abs(self.replay_cost - self.solution.cost) / abs(self.solution.cost)
+        """Relative difference between the costs of the replay and of the solver; as it is where J is 0."""
+        return abs(self.replay_cost - self.solution.cost) / (abs(self.solution.cost) or 1.0)
 
     @property
     def replay_agrees(self) -> bool:

@@ -223,9 +223,9 @@ def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
         f"Step: the longest in which an integrator follows a free motion of {SLOW:g} rad/s, {DURATION:g} s. "
         f"Rate: the fastest motion that it follows over {TURN:g} rad, {DURATION:g} s at most, in the scene's "
         f"steps of {dt:g} s. "
-        f"Stiffness: that of the stiffest joints whose swings of {DEFLECTION:g} rad stay bounded over "
-        f"{SWINGS} of these steps. An integrator follows a motion if the tip ends within {CLOSE:g} m and rad "
-        "of a precise solution.",
+        "Stiffness: that of the stiffest joints, with rigid gears and no friction, whose swings of "
+        f"{DEFLECTION:g} rad stay bounded over {SWINGS} of these steps. An integrator follows a "
+        f"motion if the tip ends within {CLOSE:g} m and rad of a precise solution.",
     )
     units = {row["quantity"]: row["unit"] for row in rows}
     wide = []

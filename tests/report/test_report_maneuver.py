@@ -124,6 +124,15 @@ def test_scenes_in_single_precision_are_replayed_in_double(short_run: ManeuverRu
     assert run.finer_errors == short_run.finer_errors
 
 
+def test_a_maneuver_that_costs_nothing_is_shown_too(short_scene: Scene) -> None:
+    still = compile_scene(short_scene).tip_pose(StateLayout.of(short_scene).initial_state)
+    run = run_maneuver(short_scene.replace(target={"pose": {"dual_quaternion": still.tolist()}}))
+    assert run.solution.cost == run.replay_cost == run.replay_difference == 0.0
+    assert run.replay_agrees
+    print_tables(Console(file=io.StringIO()), run)
+    assert summarize(run)["replay"]["relative_difference"] == 0.0
+
+
 def test_finer_steps_show_the_error_of_a_poor_integrator(short_scene: Scene) -> None:
     simulation = {"dt": 0.05, "steps": 60, "integrator": "symplectic_euler"}
     poor = short_scene.replace(simulation=simulation)

@@ -67,6 +67,26 @@ def test_observed_order_of_a_power_law() -> None:
     assert observed_order(steps, [1e-3 * step**3 for step in steps], uncertainty=1.0) is None
 
 
+@pytest.mark.parametrize(
+    ("name", "tolerance", "told"),
+    [
+        ("rk4", None, "steps of 0.05 s, ends"),
+        ("rodas4", 1e-3, "steps of 0.05 s and a tolerance of 0.001, ends"),
+    ],
+)
+def test_the_error_of_the_own_integrator_is_told_with_its_tolerance(
+    name: str, tolerance: float | None, told: str, short_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Section, "add_figure", lambda *given: None)
+    point = {"integrator": name, "order": 4, "step_s": 0.05, "tolerance": tolerance, "error": 1e-4}
+    found = {
+        "points": [{**point, "single_us": 1.0, "batch_us": 1.0}],
+        "reference": [{"uncertainty": 1e-12, "duration_s": 3.0}],
+    }
+    own = short_scene.replace(simulation={"integrator": name})
+    assert told in integrator_precision.section(own, found).notes[-1]
+
+
 def test_the_reference_is_more_precise_than_what_it_judges(precision: dict) -> None:
     assert precision["reference"][0]["uncertainty"] < 1e-11
     assert precision["reference"][0]["duration_s"] == pytest.approx(3.0)
