@@ -77,8 +77,10 @@ class ProcessExecutor:
             workers: Number of processes.
 
         Raises:
-            ValueError: If there are none.
+            ValueError: If there are none, or it is no whole number.
         """
+        if not hasattr(workers, "__index__"):
+            raise ValueError(f"workers: {workers!r}, should be a whole number of at least 1")
         if workers < 1:
             raise ValueError(f"workers: {workers}, should be at least 1")
         self.workers = workers

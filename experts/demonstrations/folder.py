@@ -20,7 +20,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -41,6 +41,15 @@ class Part(NamedTuple):
 
     number: int
     of: int
+
+    @classmethod
+    def of_pair(cls, pair: tuple[int, int]) -> Self:
+        """Check what a user asks for; the numbers name files."""
+        fits = isinstance(pair, tuple | list) and len(pair) == 2
+        whole = fits and all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in pair)
+        if not whole or not 1 <= pair[0] <= pair[1]:
+            raise ValueError(f"part: {pair!r}, should be (i, k), whole numbers with 1 <= i <= k")
+        return cls(int(pair[0]), int(pair[1]))
 
     def shards(self, n_shards: int) -> range:
         """Return the numbers of this part's shards."""

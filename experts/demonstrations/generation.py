@@ -114,9 +114,7 @@ def generate_demonstrations(
         KeyboardInterrupt: If the user interrupts the run; finished shards remain likewise.
     """
     settings = Settings.of(scene, n, seed, shard_size)
-    if not 1 <= part[0] <= part[1]:
-        raise ValueError(f"part: {part}, should be (i, k) with 1 <= i <= k")
-    folder = Folder(Path(out), settings, Part(*part))
+    folder = Folder(Path(out), settings, Part.of_pair(part))
     chosen = executor or local_executor(workers)
     try:
         with folder.opened():

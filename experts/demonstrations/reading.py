@@ -233,7 +233,7 @@ class Demonstrations(Sequence[Demonstration]):
 
         Raises:
             IndexError: If there is no such position.
-            ValueError: If a mask has another shape.
+            ValueError: If a mask or the positions have another shape.
             TypeError: If they are neither whole numbers nor a mask.
         """
         given = np.asarray(positions)
@@ -243,6 +243,8 @@ class Demonstrations(Sequence[Demonstration]):
             given = np.flatnonzero(given)
         elif given.size and not np.issubdtype(given.dtype, np.integer):
             raise TypeError(f"positions are of type {given.dtype}; expected whole numbers, or a mask")
+        if given.ndim != 1:
+            raise ValueError(f"positions have shape {given.shape}; expected (M,)")
         chosen = self._places[given.astype(np.int64)]
         return type(self)(self.path, self.settings, self.manifest, selection=(self._files, chosen))
 
@@ -318,10 +320,10 @@ class Demonstrations(Sequence[Demonstration]):
             Batches, copies in memory.
 
         Raises:
-            ValueError: If the size is not positive, or a name is unknown.
+            ValueError: If the size is no whole number or not positive, or a name is unknown.
         """
-        if size < 1:
-            raise ValueError(f"size: {size}, should be at least 1")
+        if not isinstance(size, int | np.integer) or size < 1:
+            raise ValueError(f"size: {size!r}, should be a whole number of at least 1")
         _check_names(names, with_parameters(TRAJECTORIES, self._files.layout))
         return self._batches(size, tuple(names), seed, drop_last)
 

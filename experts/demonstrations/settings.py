@@ -43,9 +43,9 @@ class Settings:
                 raise ValueError(f"{name}: {value!r}, should be a whole number of at least {least}")
             if value < least:
                 raise ValueError(f"{name}: {value}, should be at least {least}")
+            if value >= 2**63:  # `settings.json` could not be read again
+                raise ValueError(f"{name}: {value}, should be less than 2**63")
         n, seed, shard_size = int(n), int(seed), int(shard_size)  # `settings.json` has no NumPy
-        if seed >= 2**63:  # `settings.json` could not be read again
-            raise ValueError(f"seed: {seed}, should be less than 2**63")
         resolved = in_double_precision(load_scene(scene))
         DQSpaceArmVectorEnv(1, resolved)  # refuses a scene without normalized actions
         if n > 1 and not any(resolved.spread.model_dump().values()):

@@ -124,8 +124,13 @@ def test_single_precision_is_taken_in_double(quick_scene: Scene, tmp_path: Path)
         ({"seed": -1}, "seed: -1, should be at least 0"),
         ({"seed": 2**63}, r"seed: 9223372036854775808, should be less than 2\*\*63"),
         ({"shard_size": 0}, "shard_size: 0, should be at least 1"),
+        ({"shard_size": 2**63}, r"shard_size: 9223372036854775808, should be less than 2\*\*63"),
         ({"part": (3, 2)}, "1 <= i <= k"),
+        ({"part": (1.5, 2)}, r"part: \(1.5, 2\), should be \(i, k\), whole numbers"),
+        ({"part": 1}, r"part: 1, should be \(i, k\)"),
+        ({"part": (1, 2, 3)}, r"part: \(1, 2, 3\), should be \(i, k\)"),
         ({"workers": 0}, "workers: 0, should be at least 1"),
+        ({"workers": 2.5}, "workers: 2.5, should be a whole number"),
         ({"scene": load_scene("planar").replace(spread=Spread())}, "would be the same"),
     ],
 )

@@ -69,6 +69,9 @@ def test_it_is_a_sequence(whole: Demonstrations):
         whole.select(cheap[:3])
     with pytest.raises(TypeError, match="positions are of type float64; expected whole numbers, or a mask"):
         whole.select([0.0, 1.0])
+    for wrong in (3, [[0, 1], [2, 3]]):
+        with pytest.raises(ValueError, match=r"positions have shape .*; expected \(M,\)"):
+            whole.select(wrong)
     with pytest.raises(IndexError):
         whole[18]
 
@@ -121,8 +124,9 @@ def test_shuffled_batches_repeat_with_their_seed_and_mix_demonstrations(whole: D
 
 
 def test_batches_refuse_nonsense(whole: Demonstrations):
-    with pytest.raises(ValueError, match="size: 0"):
-        whole.batches(0)
+    for size in (0, 2.5):
+        with pytest.raises(ValueError, match=f"size: {size}, should be a whole number of at least 1"):
+            whole.batches(size)
     with pytest.raises(ValueError, match="velocities: unknown; choose from states"):
         whole.batches(10, ("states", "velocities"))
     with pytest.raises(ValueError, match="price: unknown; choose from index"):
