@@ -279,7 +279,7 @@ def failure_list(facts: Facts) -> TextTable:
 
 def number(value: float) -> str:
     """Format with three digits."""
-    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
+    return f"{value:.0f}" if 999.5 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def share(part: float, whole: float) -> str:

@@ -44,7 +44,8 @@ PIECE = 16
 PADDING, MARGIN = 1.3, 2**25
 """Overhead of HDF5 on the size of the arrays: a factor, and bytes."""
 MINARI_MISSING = 'this needs Minari: pip install "dq-space-arm[minari]" ({} is missing)'
-_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")
+# Minari knows no namespace of one character.
+_ID = re.compile(r"(?![-\w]/[^/]*$)([-\w]+/)*[-\w]+-v\d+")
 _FOLDER_VARIABLE = "MINARI_DATASETS_PATH"
 _DESCRIPTION = """\
 {count} optimal maneuvers of scene {name!r} in DQSpaceArm-v0, from random starts: converged, successful, \
@@ -145,7 +146,8 @@ def check_dataset_id(dataset_id: str) -> None:
     """Raise ValueError if a name is not one of Minari's: it becomes a path."""
     if not _ID.fullmatch(dataset_id):
         raise ValueError(
-            f"dataset_id: {dataset_id!r}, should be a name with a version, such as space-arm/paper/expert-v0"
+            f"dataset_id: {dataset_id!r}, should be a name with a version, such as "
+            "space-arm/paper/expert-v0, in a namespace of two characters or more if any"
         )
 
 
@@ -156,7 +158,7 @@ def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     from minari.storage import get_dataset_path
 
     place = get_dataset_path(dataset_id)
-    staging = get_dataset_path() / f".{dataset_id.replace('/', '-')}.part"
+    staging = get_dataset_path() / f".{dataset_id.replace('/', '.')}.part"  # no other name has a dot
     name = f"the Minari data set {dataset_id}"
     # A folder without data is a namespace that holds other data sets.
     with staged(place, staging, marker="data", overwrite=overwrite, name=name) as made:

@@ -22,7 +22,7 @@ minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
 
 ID = "space-arm/quick/expert-v0"
-STAGING = ".space-arm-quick-expert-v0.part"
+STAGING = ".space-arm.quick.expert-v0.part"
 
 
 @pytest.fixture
@@ -208,6 +208,13 @@ def test_two_processes_do_not_write_the_same_data_set(whole: Demonstrations, roo
     assert export_to_minari(whole[:1], ID).total_episodes == 1
 
 
+@pytest.mark.slow
+def test_names_that_differ_in_a_slash_are_written_side_by_side(whole: Demonstrations, root: Path):
+    names = ["space/arm-v0", "space-arm-v0"]
+    export_to_minari(whole[:1], names[0], progress=lambda done: export_to_minari(whole[:1], names[1]))
+    assert {*minari.list_local_datasets()} == {*names}
+
+
 def test_a_disk_without_room_is_refused_before_hdf5_finds_out(
     whole: Demonstrations, root: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -217,7 +224,9 @@ def test_a_disk_without_room_is_refused_before_hdf5_finds_out(
     assert list(root.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["", "quick", "quick-v", "/quick-v0", "../quick-v0", ".quick-v0", "a b-v0"])
+@pytest.mark.parametrize(
+    "name", ["", "quick", "quick-v", "/quick-v0", "../quick-v0", ".quick-v0", "a b-v0", "a/quick-v0"]
+)
 def test_a_name_has_to_be_one(whole: Demonstrations, root: Path, name: str):
     with pytest.raises(ValueError, match=re.escape(f"dataset_id: {name!r}, should be a name with a version")):
         export_to_minari(whole, name)

@@ -68,6 +68,13 @@ def test_quantities_are_those_of_the_data(facts: Facts, whole: Demonstrations):
     assert sum(int(row[1]) for row in tables.ends(facts).rows) == 18
 
 
+def test_numbers_have_three_digits_or_all_before_the_point():
+    values = (0.0123456, 12.3456, 999.4, 999.6, 1000.4, 123456.7, 2e6)
+    shown = ["0.0123", "12.3", "999", "1000", "1000", "123457", "2e+06"]
+    assert [tables.number(value) for value in values] == shown
+    assert tables.number(-999.6) == "-1000"
+
+
 def test_the_log_counts_each_shard_once(folder: Path):
     log = next((folder / "log").glob("*.jsonl"))
     first, *lines = log.read_text().splitlines()
