@@ -180,6 +180,8 @@ def step_call(
 def _along(motion: Motion, kernels: Kernels, count: int) -> tuple[FloatArray, FloatArray]:
     """States along a motion and the inputs there, shapes (count, n_x) and (count, n_u)."""
     states = motion.states(kernels, "rk8", 4, every=4)
+    if not np.isfinite(states).all():  # a step from there would be timed
+        states = motion.states(kernels, "rodas5p", 4, every=4)
     places = np.linspace(0, len(motion.controls) - 1, count).astype(int)
     return np.ascontiguousarray(states[places]), np.ascontiguousarray(motion.controls[places])
 

@@ -96,9 +96,12 @@ def test_stiff_joints_get_a_stiff_reference(short_scene: Scene) -> None:
     (link,) = short_scene.links
     stiff = short_scene.replace(links=[link.model_copy(update={"stiffness": 1e9})])
     start = np.array(compile_scene(stiff).layout.initial_state)
-    end, uncertainty = reference_end(Motion(stiff, start, np.zeros((60, 2))))
+    motion = Motion(stiff, start, np.tile([0.5, 0.3], (60, 1)))
+    end, uncertainty = reference_end(motion)
     assert np.isfinite(end).all()
     assert uncertainty < 1e-9
+    timed, _ = integrator_precision._along(motion, compile_scene(stiff), 8)
+    assert np.isfinite(timed).all()
 
 
 def test_integrators_follow_the_expert_through_phases() -> None:
