@@ -33,7 +33,8 @@ NAME = "report"
 def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False) -> Page:
     """Measure a scene and write report.html, report.md and report.json after each part.
 
-    An interrupted report of the same scene, effort and version resumes: its parts are kept.
+    An interrupted report of the same scene, effort and version, on a machine of the same kind, resumes: its
+    parts are kept.
 
     Args:
         scene: The scene.
@@ -57,7 +58,7 @@ def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False)
         "versions": origin["versions"],
         "commit": origin["commit"],
     }
-    found = _unfinished(folder / f"{NAME}.json", request)
+    found = _unfinished(folder / f"{NAME}.json", {"request": request, "machine": origin["machine"]})
     if found:
         console.print(f"Resuming: {', '.join(found)} are kept from an interrupted report.", markup=False)
     page = Page(
@@ -121,14 +122,14 @@ def _kept_section(
         return None
 
 
-def _unfinished(file: Path, request: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Parts of an interrupted report of the same request; none if there is none."""
+def _unfinished(file: Path, wanted: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Parts of an interrupted report of the same request and machine; none if there is none."""
     try:
         record = read_mapping(file)
     except UnreadableError:
         return {}
-    parts, asked = record.get("parts"), record.get("request")
+    parts, asked = record.get("parts"), {name: record.get(name) for name in wanted}
     if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
         return {}
-    same = asked == json.loads(json.dumps(json_value(request)))
+    same = asked == json.loads(json.dumps(json_value(wanted)))
     return parts if same and parts.keys() < PARTS.keys() else {}
