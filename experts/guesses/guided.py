@@ -205,7 +205,7 @@ class GuidedDDP:
                 its own.
             KeyboardInterrupt: If the user interrupts the preparation of the library.
         """
-        given = self.problem.parameters.checked(parameters)
+        given = np.array(self.problem.parameters.checked(parameters))  # which may be the problem's own
         _ = self.coarsening  # finding it takes nominal parameters, and so does the preparation of the library
         if self._coarse is None:
             _ = self.library

@@ -122,6 +122,15 @@ def test_the_optimal_cost_changes_as_the_derivatives_by_parameters_say(solver):
         assert gradient[i] == pytest.approx((costs[0] - costs[1]) / (2.0 * size), rel=1e-5, abs=1e-8)
 
 
+@pytest.mark.slow
+def test_the_present_parameters_of_a_problem_are_those_of_a_guided_solve(scene, solver):
+    """Preparing guesses takes nominal ones in between."""
+    p, problem = values(solver), ArmProblem(scene)
+    problem.parameters.set(p)
+    solution = GuidedDDP(problem).solve(parameters=problem.parameters.rows)
+    np.testing.assert_array_equal(solution.parameters, np.tile(p, (STEPS + 1, 1)))
+
+
 def test_a_solved_maneuver_serves_other_targets(solver):
     guided = GuidedDDP(solver.problem, screw_motion=False, attempts=1)
     guided.library  # noqa: B018  # solved beforehand
