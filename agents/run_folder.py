@@ -85,7 +85,7 @@ class RunFolder:
             if found:
                 raise RunFolderError(
                     f"{path} was started with another configuration: {'; '.join(found)}. Use that one, or "
-                    "use another folder"
+                    "use another folder (--out)"
                 )
         # A configuration only names its scene; the file of that name may have changed.
         scene = load_scene(configuration.scene).content_hash()
@@ -93,7 +93,7 @@ class RunFolder:
         if any(start.get("scene_hash", scene) != scene for start in starts):
             raise RunFolderError(
                 f"{path} was started with another version of scene {configuration.scene!r}: use another "
-                "folder"
+                "folder (--out)"
             )
         write_atomically(file, dump_yaml(here, _HEADER), durable=True)
         origin = provenance("ruamel.yaml", "sb3-contrib", "stable-baselines3", "torch")

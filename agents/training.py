@@ -46,7 +46,7 @@ def train(
         ConfigurationError: If the configuration is invalid.
         SceneError: If its scene cannot be loaded.
         RunFolderError: If the folder is for another configuration, or another process trains there.
-        ImportError: If the extra `agents` is not installed.
+        ImportError: If the extra `agents` is not installed, which all but policy gradients need.
         DivergedError, ValueError: If the training diverges; the last checkpoint remains.
         KeyboardInterrupt: On Ctrl-C; the last checkpoint remains.
     """
@@ -55,7 +55,7 @@ def train(
     try:
         run = _run(checked, folder, report or (lambda advance: None))
     except ModuleNotFoundError as error:
-        if error.name not in ("stable_baselines3", "sb3_contrib", "torch", "tensorboard", "threadpoolctl"):
+        if error.name not in ("stable_baselines3", "sb3_contrib", "torch", "tensorboard"):
             raise
         raise ImportError(f'training needs {error.name}: pip install "dq-space-arm[agents]"') from error
     from agents.run_folder import reserved

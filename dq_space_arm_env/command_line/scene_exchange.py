@@ -18,16 +18,15 @@ from typing import Any, Literal
 
 from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.algebra import dual_quaternion, poses, rotations
-from dq_space_arm_env.command_line.scene_warnings import warnings_of, way_to_target
+from dq_space_arm_env.command_line.scene_warnings import arm_length, warnings_of, way_to_target
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.dynamics.step_stability import joint_motion
 from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_wheels
 from dq_space_arm_env.interoperability.exporting import joint_limits
-from dq_space_arm_env.interoperability.first_maneuver import with_scaled_limits
 from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps, needs_stiff_method
 from dq_space_arm_env.interoperability.urdf_arm import HERE, UrdfTree
-from dq_space_arm_env.interoperability.urdf_elements import read_robot, without_effort
-from dq_space_arm_env.scene import Link, Simulation
+from dq_space_arm_env.interoperability.urdf_elements import read_robot
+from dq_space_arm_env.scene import Link, Simulation, Success
 
 _OPTIONS = {
     r"spacecraft=\{'mass': \.\.\., 'inertia': \.\.\.\}": "--spacecraft-mass and --spacecraft-inertia",
@@ -45,6 +44,7 @@ _OPTIONS = {
 
 
 _MOST_ENDS = 12  # of arms that are listed
+_TOLERANCE = 0.1  # most of the position at the end, relative to the length of the arm
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,9 @@ class Imported:
 
     scene: Scene
     warnings: tuple[str, ...]
-    # Limits of the torques, base to tip, before they were lowered, N m; passive: None.
+    # Efforts of the file, base to tip, N m; without a motor, or an effort: None.
     efforts: tuple[float | None, ...]
+    spacecraft: float = 0.0  # mass that the file does not have, kg
     steps: tuple[StepTrial, ...] = ()  # integrators and time steps that were measured
 
 
@@ -102,24 +103,25 @@ def import_urdf(
         raise SceneError(f"--tip LINK is missing, the link that is to reach the target:\n{tips}")
     with warnings.catch_warnings(record=True) as caught, in_options():
         warnings.simplefilter("always")
-        own = scene_from_urdf(path, tip, **arguments)
-    if "dampers" not in arguments and needs_stiff_method(own):
+        scene = scene_from_urdf(path, tip, **arguments, scaled_efforts=proposals.scaled_efforts)
+    if "dampers" not in arguments and needs_stiff_method(scene):
         raise SceneError(
-            f"dampers of {path} stop joints within {_stopping(own)}, too fast for rk4: solving would take "
+            f"dampers of {path} stop joints within {_stopping(scene)}, too fast for rk4: solving would take "
             "minutes and training hours. They are guesses in many files: --no-dampers leaves them out, "
             "--dampers keeps them"
         )
-    scene = with_scaled_limits(own, without_effort(read_robot(path))) if proposals.scaled_efforts else own
     if proposals.wheels != "ideal":
         scene = with_wheels(scene, proposals.wheels)
     if proposals.thrusters != "ideal" and scene.actuators.base_force is not None:
         scene = with_jets(scene, 0.5 * max(scene.actuators.base_force.limit))
-    scene = scene.replace(spread=_spread(scene, proposals.spread))
+    scene = scene.replace(spread=_spread(scene, proposals.spread), success=_success(scene))
     steps = tuple(measured_steps(scene)) if proposals.measured else ()
     scene = steps[-1].of(scene) if steps else scene
     messages = (str(each.message).removeprefix("URDF: ") for each in caught)
-    efforts = tuple(link.torque_limit for link in own.links)
-    return Imported(scene, (*messages, *warnings_of(scene)), efforts, steps)
+    written = {joint.child: joint.effort for joint in read_robot(path).joints.values()}
+    efforts = tuple(written[link.name] if link.actuated else None for link in scene.links)
+    added = (arguments.get("spacecraft") or {}).get("mass", 0.0)
+    return Imported(scene, (*messages, *warnings_of(scene)), efforts, added, steps)
 
 
 def _spread(scene: Scene, width: float) -> dict[str, float]:
@@ -135,6 +137,13 @@ def _spread(scene: Scene, width: float) -> dict[str, float]:
         "base_rotation": width,
         "base_position": width if pushed else 0.0,
     }
+
+
+def _success(scene: Scene) -> dict[str, float]:
+    """A tolerance in proportion to the arm from its first joint on, but no more than the usual one."""
+    length = arm_length(scene) - math.hypot(*scene.links[0].joint.position)
+    usual = Success().position_error
+    return {"position_error": min(usual, float(f"{_TOLERANCE * length:.1g}") or usual)}
 
 
 def mounted(position: tuple[float, ...] | None, degrees: tuple[float, ...] | None) -> dict[str, Any]:
@@ -209,7 +218,9 @@ def _lines(imported: Imported, file: str) -> Iterator[str]:
     links = ", ".join(f"{link.name} {_number(link.mass, 4)} kg" for link in scene.links)
     joints = "1 joint" if len(scene.links) == 1 else f"{len(scene.links)} joints"
     yield f"{file}: {scene.name}, {joints}"
-    yield f"  base    {_number(scene.base.mass, 4)} kg"
+    whole, part = (_number(mass, 4) for mass in (scene.base.mass, imported.spacecraft))
+    share = f", {part} kg of it the spacecraft's" if imported.spacecraft and part != whole else ""
+    yield f"  base    {whole} kg{share}"
     yield f"  links   {links}"
     yield f"  limits  {'; '.join(_limits(scene)) or 'no motors'}; edit actuators and links"
     yield from _scaled(imported)
@@ -219,7 +230,11 @@ def _lines(imported: Imported, file: str) -> Iterator[str]:
     yield f"  joints  {ranges} with limits of the angle, {rates} of the rate; edit constraints"
     start = zip(scene.links, scene.initial_state.joint_angles, strict=True)
     yield f"  start   at rest, {', '.join(_by_kind(start, 'unit', ' at'))}; edit initial_state"
-    yield f"  target  {degrees:.3g} degrees and {meters:.3g} m from the start; edit target"
+    within = scene.success
+    yield (
+        f"  target  {degrees:.3g} degrees and {meters:.3g} m from the start, to be reached within "
+        f"{within.attitude_error_deg:g} degrees and {within.position_error:g} m; edit target and success"
+    )
     yield from _steps(imported)
     spread = scene.spread
     if any(each for each in spread.model_dump().values()):
@@ -249,6 +264,10 @@ def _scaled(imported: Imported) -> Iterator[str]:
             f"file's efforts, {efforts}, work against gravity and are up to {most:,.0f} times as large; "
             "--full-efforts keeps them"
         )
+    pairs = zip(own, imported.scene.links, strict=True)
+    free = [link.name for before, link in pairs if before is None and link.actuated]
+    if free:
+        yield f"          the file has no effort for {', '.join(free)}: --joint-torque gives another limit"
 
 
 def _steps(imported: Imported) -> Iterator[str]:

@@ -28,13 +28,15 @@ _LIGHT = 0.005  # kg
 _GYRATION = 3.0  # radius of gyration of a base relative to the reach of the arm, or 1 m
 _DENSE = 1e5  # kg/m^3, of the cube with a body's mass and inertia: five times tungsten
 _STEP = 1.0  # s
+_NEAR = 2.0  # times a tolerance, of a way to the target
+_ROUNDED = 9  # digits after the point of a distance, m
 _SPEEDS = 0.5, 45.0  # m/s and degrees/s, on the mean way to the target
 _TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the efforts of a swing
 
 
 def warnings_of(scene: Scene) -> list[str]:
     """List what is unwise in a valid scene, a sentence each, which names the key and says what would help."""
-    checks = (_units, _masses, _limits, _start, _times, _reach)
+    checks = (_units, _masses, limit_warnings, _start, _times, _reach)
     return [sentence for check in checks for sentence in check(scene)]
 
 
@@ -71,9 +73,9 @@ def _masses(scene: Scene) -> Iterator[str]:
     if scene.base.mass < arm:
         yield (
             f"base.mass: {scene.base.mass:.3g} kg, lighter than the arm of {arm:.3g} kg: is the spacecraft "
-            "missing? --spacecraft-mass of `scenes import` adds it"
+            "missing, or too light? --spacecraft-mass of `scenes import` sets it"
         )
-    reach = max(min(_length(scene), _FAR), 1.0)
+    reach = max(min(arm_length(scene), _FAR), 1.0)
     light, wide, dense = [], [], []
     bodies = [("base", scene.base)] + [(f"links[{i}]", link) for i, link in enumerate(scene.links)]
     for place, body in bodies:
@@ -105,8 +107,8 @@ def _together(found: Iterable[tuple[str, str]]) -> Iterator[str]:
         yield ": ".join(places[0]) + (f" Likewise {others}" if others else "")
 
 
-def _limits(scene: Scene) -> Iterator[str]:
-    """Torques that are out of proportion to what free flight takes."""
+def limit_warnings(scene: Scene) -> Iterator[str]:
+    """Say which torques are out of proportion to what free flight takes."""
     motors = scene.actuators.joint_torque
     if motors is None:
         return
@@ -131,7 +133,7 @@ def _limits(scene: Scene) -> Iterator[str]:
 
 
 def _several(where: str, found: list[tuple[float, str, float]]) -> str:
-    return where if len(found) == 1 else f"{len(found)} are out of proportion, the most {where}"
+    return where if len(found) == 1 else f"{len(found)} of them are out of proportion, the most {where}"
 
 
 def _start(scene: Scene) -> Iterator[str]:
@@ -149,7 +151,7 @@ def _start(scene: Scene) -> Iterator[str]:
 
 
 def _times(scene: Scene) -> Iterator[str]:
-    """Steps of seconds, and episodes that are too short for the way."""
+    """Steps of seconds, episodes that are too short for the way, and tolerances that are as long."""
     simulation = scene.simulation
     if simulation.dt > _STEP:
         yield f"simulation.dt: {simulation.dt:g} s: milliseconds?"
@@ -159,6 +161,12 @@ def _times(scene: Scene) -> Iterator[str]:
         yield (
             f"simulation.steps: an episode of {seconds:.3g} s for {meters:.3g} m and {degrees:.3g} degrees "
             "to the target: is it long enough?"
+        )
+    tolerance = scene.success.position_error
+    if not drifts and scene.target.motion is None and 0.0 < meters < _NEAR * tolerance:
+        yield (
+            f"success.position_error: {tolerance:g} m, where the way to the target is {meters:.3g} m: hardly "
+            "anything fails"
         )
 
 
@@ -172,7 +180,8 @@ def way_to_target(scene: Scene) -> tuple[float, float]:
     target = np.atleast_2d(shown_target(scene)[0])[0]
     way = dual_quaternion.multiply(dual_quaternion.conjugate(tip), tuple(target.tolist()))
     rotation, position = poses.to_rotation_and_position(way)
-    return math.degrees(2.0 * math.atan2(math.hypot(*rotation[1:]), abs(rotation[0]))), math.hypot(*position)
+    degrees = math.degrees(2.0 * math.atan2(math.hypot(*rotation[1:]), abs(rotation[0])))
+    return degrees, round(math.hypot(*position), _ROUNDED)
 
 
 def _reach(scene: Scene) -> Iterator[str]:
@@ -187,7 +196,7 @@ def _reach(scene: Scene) -> Iterator[str]:
     seconds = simulation.steps * simulation.dt
     pushed = 0.25 * _force(scene) / total * seconds**2  # there and to rest, by the largest force
     # From the center of mass the base is at most the arm's share of the mass times its length.
-    reach = _length(scene) * (2.0 - scene.base.mass / total) + scene.success.position_error
+    reach = arm_length(scene) * (2.0 - scene.base.mass / total) + scene.success.position_error
     distance = math.dist(goal, center)
     if distance > reach + pushed:
         by = f", thrusters move it by {pushed:.3g} m in {seconds:g} s" if pushed else ""
@@ -220,8 +229,8 @@ def _force(scene: Scene) -> float:
     return (math.hypot(*force.limit) if force is not None else 0.0) + sum(jet.force for jet in jets)
 
 
-def _length(scene: Scene) -> float:
-    """Length of the stretched arm from the base's center of mass to the tip, m."""
+def arm_length(scene: Scene) -> float:
+    """Length of the stretched arm from the base's center of mass to the tip, m; infinite for free slides."""
     length = math.hypot(*scene.tip.position)
     if scene.wrist is not None:
         length += math.hypot(*scene.wrist.frame.position)

@@ -202,7 +202,7 @@ def _write(path: Path, text: str) -> None:
 @click.option("--tip", type=PartOf("link", "robot"), help="Link that is to reach the target.")
 @click.option("--base", type=PartOf("link", "robot"), help="Link that floats.  [default: the root]")
 @click.option("--out", type=click.Path(dir_okay=False), help="Scene file.  [default: as ROBOT, .yaml]")
-@click.option("--name", help="Name of the scene.  [default: the robot's]")
+@click.option("--name", help="Name of the scene.  [default: as the file]")
 @click.option("--spacecraft-mass", type=float, help="Mass of a body fixed to the base link, kg.")
 @click.option(
     "--spacecraft-inertia",
@@ -255,7 +255,9 @@ def _write(path: Path, text: str) -> None:
     show_default=True,
     help="Limit of ideal wheels, N m; 0 for none.",
 )
-@click.option("--joint-torque", type=float, help="Limit of joints without an effort in ROBOT, N m.")
+@click.option(
+    "--joint-torque", type=float, help="Limit of joints without an effort in ROBOT, N m.  [default: scaled]"
+)
 @click.option(
     "--passive", type=PartOf("joint", "robot"), multiple=True, help="Joint without a motor; may be repeated."
 )
@@ -337,6 +339,7 @@ def import_(
     from dq_space_arm_env.command_line.scene_template import commented_yaml
 
     path = _scene_file(out or f"{Path(robot).stem}.yaml", force)
+    arguments["name"] = arguments.get("name") or path.stem
     if replay:
         check_writable_file(path.with_suffix(".html"))
     spacecraft = given(mass=spacecraft_mass, inertia=spacecraft_inertia)

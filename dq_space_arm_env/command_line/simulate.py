@@ -89,6 +89,7 @@ def simulate(
     inputs.
     """
     from dq_space_arm_env import load_scene
+    from dq_space_arm_env.command_line.scene_warnings import limit_warnings
     from dq_space_arm_env.command_line.simulated_episode import (
         begin,
         drowned_inputs,
@@ -105,6 +106,9 @@ def simulate(
     disturbance = read_noise(noise, loaded)
     if (drowned := drowned_inputs(disturbance, loaded)) is not None:
         complain(drowned, label="Warning: ")
+    elif disturbance.any() and not all("=" in each for each in noise):  # fractions of the limits
+        for warning in limit_warnings(loaded):
+            complain(warning, label="Warning: ")
     begun = begin(loaded, seed, start)
     pilot = load_policy(policy, begun, message_console(), seed, trust=trust, normalize=normalize)
     flight = fly(loaded, begun, pilot, seed=seed, noise=disturbance, label=label)

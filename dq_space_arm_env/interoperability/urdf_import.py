@@ -23,7 +23,7 @@ from dq_space_arm_env.interoperability.first_maneuver import (
 )
 from dq_space_arm_env.interoperability.rigid_body import Body, tidied
 from dq_space_arm_env.interoperability.urdf_arm import HERE, Arm, ArmJoint, arm_of, missing_efforts
-from dq_space_arm_env.interoperability.urdf_elements import read_robot, without_effort
+from dq_space_arm_env.interoperability.urdf_elements import UNLIMITED, read_robot, without_effort
 from dq_space_arm_env.scene import Pose, Scene, SceneError
 from dq_space_arm_env.scene.bodies import BASE, Inertia
 from dq_space_arm_env.validation import Model, Positive, Vector3
@@ -80,7 +80,8 @@ def scene_from_urdf(
             thrusters.
         base_torque: Limit of the wheels' torque on the base, N m, for each axis or one for all; None for no
             wheels.
-        joint_torque: Limit of the joints for which the URDF gives no effort, or zero, N m (N of slides).
+        joint_torque: Limit of the joints for which the URDF gives no effort, or zero, N m (N of slides). None
+            refuses such joints, unless `scaled_efforts` finds limits for them.
         passive: Names of the joints that have no motor.
         lock_branches: Names of movable joints beside the way from base to tip, as those of a gripper or of
             another arm, that are held at zero; True for all of them. Others that move a mass are joints of
@@ -91,8 +92,8 @@ def scene_from_urdf(
             raising the smallest principal moment; otherwise they are refused.
         dampers: Whether to keep the viscous damping of the joints.
         scaled_efforts: Whether to lower the URDF's limits of the torques to three times what a swing of all
-            joints by 1 rad in seconds takes; `joint_torque` stays. Efforts for work against gravity are
-            hundreds of times that.
+            joints by 1 rad in seconds takes, and to give these to joints without; `joint_torque` stays.
+            Efforts for work against gravity are hundreds of times that.
 
     Returns:
         The scene.
@@ -108,15 +109,20 @@ def scene_from_urdf(
     is_number = isinstance(joint_torque, int | float | np.number) and joint_torque is not True
     if joint_torque is not None and not (is_number and joint_torque > 0):
         raise SceneError(f"joint_torque = {joint_torque!r}: must be a number greater than 0, N m")
+    kept = without_effort(robot) if joint_torque is not None else []
+    if joint_torque is None and scaled_efforts:
+        joint_torque = UNLIMITED  # which is lowered
     motorless = passive if joint_torque is None else robot.joints
     arm = arm_of(robot, tip, base, lock_branches, extra, mount, balance_inertias, motorless)
     _check_passive(arm, passive)
     _warn(arm)
-    center = ", ".join(f"{number:.9g}" for number in arm.base_center)
+    center = ", ".join(f"{number:.6g}" for number in arm.base_center)
     frame = f"link {arm.base_link}" if mount == HERE else "the spacecraft"
+    fixed = f"link {arm.base_link}" if extra is None else f"spacecraft and link {arm.base_link}"
     data: dict[str, Any] = {
         "name": robot.name if name is None else name,
-        "description": f"From the URDF of {robot.name}: base frame at ({center}) m in {frame}.",
+        "description": f"From the URDF of {robot.name}: the base frame, at the center of mass of {fixed}, is "
+        f"at ({center}) m in {frame}.",
         "base": {"mass": arm.base.mass, "inertia": tidied(arm.base.inertia).tolist()},
         "links": _links(arm, joint_torque, passive, dampers),
         "tip_link": None if arm.way == len(arm.joints) else arm.joints[arm.way - 1].joint.child,
@@ -132,7 +138,7 @@ def scene_from_urdf(
     }
     scene = with_torque_weights(stable(_validated(data, robot.name)), arm)
     if scaled_efforts:
-        scene = with_scaled_limits(scene, without_effort(robot))
+        scene = with_scaled_limits(scene, kept)
     return scene if target is not None else scene.replace(target={"pose": default_target(scene, arm)})
 
 

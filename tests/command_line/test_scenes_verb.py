@@ -150,7 +150,7 @@ def test_a_valid_scene_whose_steps_blow_up_is_told_what_to_take(
     assert main(["scenes", "validate", str(file)]) == SUCCESS
     first, second = capsys.readouterr().out.splitlines()
     assert first == f"{file}: valid"
-    assert second.startswith(f"{file}: warning: torque limits: 3 are out of proportion")
+    assert second.startswith(f"{file}: warning: torque limits: 3 of them are out of proportion")
 
 
 def test_shipped_scenes_come_without_warnings_but_for_light_hands() -> None:
@@ -158,7 +158,7 @@ def test_shipped_scenes_come_without_warnings_but_for_light_hands() -> None:
     assert [name for name in list_scenes() if warnings_of(load_scene(name))] == ["dual-arm"]
     (sentence,) = warnings_of(load_scene("dual-arm"))
     assert re.search(
-        "torque limits: 2 are out of proportion, the most 10 N m of '.* hand', 2,377 times", sentence
+        "torque limits: 2 of them are out of proportion, the most 10 N m of '.* hand', 2,377 times", sentence
     )
 
 

@@ -274,6 +274,7 @@ def test_limits_are_scaled_for_free_flight_and_never_raised():
     assert scene.links[0].torque_limit == scene.actuators.joint_torque.limit == 1.5
     assert scene_from_urdf(robot(*GOOD), "arm", scaled_efforts=True).links[0].torque_limit == 1.0
     unknown = robot(*GOOD).replace('effort="1"', 'effort="0"')
+    assert scene_from_urdf(unknown, "arm", scaled_efforts=True).links == scene.links
     asked = scene_from_urdf(unknown, "arm", joint_torque=40, scaled_efforts=True)
     assert asked.links[0].torque_limit == 40.0
     damped = strong.replace("<limit", '<dynamics damping="30"/><limit')
