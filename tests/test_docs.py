@@ -78,7 +78,8 @@ def blocks() -> list[tuple[str, int]]:
         (page, number)
         for page, text in WITH_README.items()
         for number, code in enumerate(code_of(text, "python"))
-        if page != "extending" and not code.startswith(">>>")  # docstrings' examples: see test_readme.py
+        # Run elsewhere: recipes below, the tutorial by test_own_robot, docstrings' examples by test_readme.
+        if page not in ("extending", "own-robot") and not code.startswith(">>>")
     ]
 
 

@@ -74,7 +74,8 @@ def train(
     Several configurations or --seeds are trained side by side, each run in its folder. Finished runs are
     kept, others resumed. One that fails does not stop the others. At the end there is one table, and the same
     in runs.json beside the folders of the runs. A cluster's machines need a file system in common.
-    Exit status 1: the folder belongs to another run, or one of several runs failed. Needs the extra `agents`.
+    Exit status 1: the folder belongs to another run, or one of several runs failed. All but policy
+    gradients (apg) need the extra `agents`.
     """
     chosen = (*configurations, *([config] if config is not None else []))
     context = click.get_current_context()

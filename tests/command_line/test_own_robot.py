@@ -54,3 +54,6 @@ def test_the_tutorial_leads_to_an_agent(
     assert found["episodes"] == 100
     assert found["success_rate"][0] >= 0.9
     assert found["violating_episodes"][0] <= 0.1
+    (code,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    exec(compile(code, "own-robot.md", "exec"), {})
+    assert capsys.readouterr().out == "True\n"
