@@ -260,6 +260,21 @@ def test_motors_that_turn_and_motors_that_slide_have_both_units(make_flight):
     assert units == ["N m or N", "mN m or mN"]
 
 
+def test_inputs_of_limits_far_apart_are_shares_of_them(paper, make_flight):
+    scene = paper.replace({"links.0.torque_limit": 2.0, "links.1.torque_limit": 0.001})
+    flight = make_flight(scene)
+    torque = panels(prepare([flight], scene), scene)[4]
+    assert (torque.unit, torque.note, torque.bounds) == (
+        "% of each limit",
+        "limits ±0.001 to ±2 N m",
+        (-100.0, 100.0),
+    )
+    limits = np.array([2.0, 0.001, 2.0])
+    place = StateLayout.of(scene).control.joint_torque
+    expected = 100.0 * flight.controls[:, place].T / limits[:, None]
+    np.testing.assert_allclose(torque.curves[0], expected, rtol=1e-12)
+
+
 def test_absent_actuators_have_no_panel(make_flight):
     scene = load_scene("planar")
     shown = panels(prepare([make_flight(scene)], scene), scene)

@@ -20,6 +20,7 @@ _ACTUATORS = {
 }
 _EULER_RATES = ("ψ̇", "θ̇", "φ̇")
 _SMALL = 0.1  # inputs below this are shown in thousandths of their unit
+_APART = 30.0  # times the smallest limit, beyond which inputs are shown as shares of their own
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,19 +68,23 @@ def _inputs(
     inputs = [each for flight in flights for each in (flight.controls, flight.noise) if each is not None]
     largest = max(float(np.abs(each[:, entries]).max()) for each in inputs)
     scale, prefix = (1e3, "m") if 0.0 < largest < _SMALL else (1.0, "")
+    factors: FloatArray = np.full((len(limits), 1), scale)
+    unit, shown = layout.control.unit(entries), layout.control.unit(entries, prefix)
+    if _APART * limits.min() < limits.max() < np.inf:  # one scale would hide the weak ones
+        factors, shown = 100.0 / limits[:, None], "% of each limit"
     sides = (0.0, 1.0) if actuator == "thruster_force" else (-1.0, 1.0)
-    unit = layout.control.unit(entries)
-    bounds = sorted({side * scale * limit for limit in limits[np.isfinite(limits)] for side in sides})
+    ends = (factors[:, 0] * limits)[np.isfinite(limits)]
+    bounds = sorted({side * end for end in np.round(ends, 9) for side in sides})
     return Panel(
         title=title,
-        unit=layout.control.unit(entries, prefix),
-        note=_limit_note(limits, f" {unit}" if prefix else "", "" if sides[0] == 0.0 else "±"),
+        unit=shown,
+        note=_limit_note(limits, "" if shown == unit else f" {unit}", "" if sides[0] == 0.0 else "±"),
         names=_names(actuator, entries, layout),
         steps=True,
         bounds=tuple(bounds),
-        curves=tuple(scale * flight.controls[:, entries].T for flight in flights),
+        curves=tuple(factors * flight.controls[:, entries].T for flight in flights),
         disturbed=tuple(
-            None if flight.noise is None else scale * (flight.controls + flight.noise)[:, entries].T
+            None if flight.noise is None else factors * (flight.controls + flight.noise)[:, entries].T
             for flight in flights
         ),
     )
