@@ -211,12 +211,11 @@ function buildConstraints() {
   constraints.names.forEach((name, index) => {
     const label = document.createElement("label");
     const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: true });
-    if (!constraints.owners.includes(index)) box.style.visibility = "hidden"; // limits of joints have no shape
     box.addEventListener("change", () => {
       moment.shown[index] = box.checked;
       refresh();
     });
-    label.append(box, name);
+    label.append(...(constraints.owners.includes(index) ? [box] : []), name); // limits of joints have no shape
     find("constraints").append(label);
   });
 }
