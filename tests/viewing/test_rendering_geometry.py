@@ -256,16 +256,18 @@ def test_mesh_moves_with_its_frames():
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
 
 
-@given(st.tuples(*[st.floats(0.2, 3.0)] * 3), st.floats(0.5, 100.0), st.integers(0, 10))
+@given(st.tuples(*[st.floats(0.2, 3.0)] * 3), st.floats(40.1, 8000.0), st.integers(0, 10))
 @settings(derandomize=True, deadline=None)
-def test_equivalent_box_has_the_inertia(edges, mass, seed):
-    """I = m / 12 diag(b^2 + c^2, c^2 + a^2, a^2 + b^2), turned."""
-    squares = np.array(edges) ** 2
+def test_equivalent_box_has_the_inertia(edges, density, seed):
+    """I = m / 12 diag(b^2 + c^2, c^2 + a^2, a^2 + b^2), turned; smaller if that is lighter than foam."""
+    squares, mass = np.array(edges) ** 2, density * np.prod(edges)
     moments = mass / 12.0 * (squares.sum() - squares)
     axes = _rotation(np.random.default_rng(seed)) if seed else np.eye(3)
     size, directions = equivalent_box(mass, axes @ np.diag(moments) @ axes.T)
     inertia = directions @ np.diag(mass / 12.0 * ((size**2).sum() - size**2)) @ directions.T
     np.testing.assert_allclose(inertia, axes @ np.diag(moments) @ axes.T, rtol=1e-9, atol=1e-9 * mass)
+    light, _ = equivalent_box(1e-3 * mass, axes @ np.diag(1e-3 * moments) @ axes.T)
+    np.testing.assert_allclose(light, np.cbrt(1e-3 * density / 40.0) * size, rtol=1e-9)
 
 
 # Camera ---------------------------------------------------------------------------------------------------

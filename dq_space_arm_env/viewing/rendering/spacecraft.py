@@ -37,17 +37,22 @@ AXIS_COLORS = ((1.0, 0.24, 0.22), (0.26, 0.88, 0.34), (0.26, 0.52, 1.0))
 
 _TARGET_POSES = 16  # of a target that moves, kept in view
 _THINNEST = 0.05  # of the longest edge: even a flat body is drawn with some thickness
+_LIGHTEST = 40.0  # kg/m^3, of a box without a shape of its own
 
 
 def equivalent_box(mass: float, inertia: ArrayLike) -> tuple[Array, Array]:
-    """Homogeneous box of an inertia, I_x = m (b^2 + c^2) / 12 etc.: edge lengths, m, and axes as columns."""
+    """Homogeneous box of an inertia, I_x = m (b^2 + c^2) / 12 etc.: edge lengths, m, and axes as columns.
+
+    It is smaller where it would be lighter than foam: many files' inertias are guesses.
+    """
     matrix = np.asarray(inertia, dtype=np.float64)
     if np.count_nonzero(matrix - np.diag(np.diag(matrix))) == 0:
         moments, axes = np.diag(matrix), np.eye(3)
     else:
         moments, axes = np.linalg.eigh(matrix)
     edges = np.sqrt(np.maximum(6.0 / mass * (moments.sum() - 2.0 * moments), 0.0))
-    return np.maximum(edges, _THINNEST * edges.max()), axes
+    edges = np.maximum(edges, _THINNEST * edges.max())
+    return edges * min(1.0, np.cbrt(mass / edges.prod() / _LIGHTEST)), axes
 
 
 def frames_before(scene: Scene) -> tuple[list[int], Array]:
