@@ -177,10 +177,14 @@ class _Learner:
     def _trial(self, environment: DQSpaceArmVectorEnv, inputs: Array) -> Array:
         """Observations (N, n_obs) under inputs (K, B, n_u), those of flights that have not diverged."""
         kernels, states, seen = environment.kernels, environment.states, []
-        along = Starts.of(kernels, states, environment.parameters, self._times).at(np.arange(SEEN))
+        given = environment.parameters if kernels.n_p else None
+        stages = None
+        if kernels.parameters.staged:
+            along = Starts.of(kernels, states, environment.parameters, self._times)
+            stages = along.at(np.arange(SEEN))
         for k, step in enumerate(np.diff(self._times)):
             left = np.full((SEEN, 1), self._times[-1] - self._times[k])
-            p = along[k] if kernels.n_p else None
+            p = given if stages is None else stages[k]
             seen.append(kernels.observation(states, left, p)[0])
             states = kernels.step(states, inputs[k], step, p=p)
         samples = np.concatenate(seen)

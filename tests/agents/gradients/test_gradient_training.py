@@ -163,23 +163,6 @@ def test_observations_that_small_inputs_hardly_vary_are_scaled_by_motions(
     assert relative[rates].max() < 0.8
 
 
-def test_a_target_moves_while_observations_are_measured(small_file, small_scene):
-    motion = {"kind": "screw", "angular_velocity": [0, 0, 0.3], "linear_velocity": [0.1, 0, 0]}
-    moving = small_scene.replace(target={"motion": motion})
-    learner = gradient_training._Learner(settings(small_file, decisions=150, crowding=0.0), moving)
-    environment = DQSpaceArmVectorEnv(gradient_training.SEEN, moving)
-    seen = [environment.reset(seed=0)[0]]
-    still = np.zeros((gradient_training.SEEN, environment.kernels.n_u))
-    for _ in range(moving.simulation.steps):
-        seen.append(environment.step(still)[0])
-    environment.reset(seed=0)
-    steps = len(learner._times) - 1
-    measured = learner._trial(environment, np.repeat(still[None], steps, axis=0))
-    at = np.rint(learner._times[:-1] / moving.simulation.dt).astype(int)
-    expected = np.concatenate([seen[each] for each in at])
-    np.testing.assert_allclose(measured, expected, rtol=0, atol=1e-5)
-
-
 def test_methods_that_adapt_their_steps_do_so_less(small_scene):
     assert gradient_training.coarser(small_scene) is small_scene
     stiff = small_scene.replace(simulation={"integrator": "rodas4"})
