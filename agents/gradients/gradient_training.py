@@ -178,7 +178,7 @@ class _Learner:
         """Observations (N, n_obs) under inputs (K, B, n_u), those of flights that have not diverged."""
         kernels, states, seen = environment.kernels, environment.states, []
         given = environment.parameters if kernels.n_p else None
-        stages = None
+        stages = None  # a target that moves stands at its start: its motion would count as spread
         if kernels.parameters.staged:
             along = Starts.of(kernels, states, environment.parameters, self._times)
             stages = along.at(np.arange(SEEN))
