@@ -116,7 +116,7 @@ def scene_from_urdf(
     arm = arm_of(robot, tip, base, lock_branches, extra, mount, balance_inertias, motorless)
     _check_passive(arm, passive)
     _warn(arm)
-    center = ", ".join(f"{number:.6g}" for number in arm.base_center)
+    center = ", ".join(f"{round(float(number), 6) + 0.0:.6g}" for number in arm.base_center)
     frame = f"link {arm.base_link}" if mount == HERE else "the spacecraft"
     fixed = f"link {arm.base_link}" if extra is None else f"spacecraft and link {arm.base_link}"
     data: dict[str, Any] = {
