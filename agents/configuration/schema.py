@@ -100,6 +100,10 @@ class DemonstrationSource(Model):
                 self.tolerance_scale,
                 "must be at most 1, for the scene's own tolerances",
             )
+        existing = "folder" if self.folder is not None else "minari"
+        if self.tolerance_scale < 1.0 and getattr(self, existing) is not None:
+            sentence = f"must be absent: existing demonstrations, here of {existing}, have met their own"
+            yield Problem(("tolerance_scale",), self.tolerance_scale, sentence)
         if self.folder is not None and self.minari is not None:
             yield Problem(("minari",), self.minari, "must be absent if a folder is given: give one")
 

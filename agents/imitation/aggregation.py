@@ -39,7 +39,6 @@ from experts.demonstrations import Demonstrations
 from experts.demonstrations.shard import PARAMETERS
 
 CORRECTIONS = "corrections.npz"
-_MOST_BYTES = 2**31  # all labels of a run fit into memory
 
 
 class Round(NamedTuple):
@@ -205,7 +204,8 @@ def _corrections(
 
 def _read(path: Path, identity: dict[str, Any]) -> tuple[Round, Corrections]:
     try:
-        content = read_arrays(path, (*COLUMNS, "facts"), _MOST_BYTES)
+        # Nothing in it is compressed, and a number counts as 8 bytes.
+        content = read_arrays(path, (*COLUMNS, "facts"), 8 * path.stat().st_size)
         facts = parse_json(str(content["facts"]), "facts")
         content.setdefault(PARAMETERS, np.zeros((len(content["states"]), 0)))
         arrays = [content[name] for name in COLUMNS]

@@ -154,12 +154,17 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
 
     @property
     def states(self) -> Array:
-        """The states, shape (num_envs, n_x), units as in `kernels.layout.state`; a copy."""
+        """The states, shape (num_envs, n_x), units as in `kernels.layout.state`; a copy.
+
+        `ResetNeeded` before the first reset, here and in the three that follow.
+        """
+        self._require_reset("reading the states")
         return self._envs.x.copy()
 
     @property
     def parameters(self) -> Array:
         """Parameters of each episode, shape (num_envs, n_p), see `DQSpaceArmEnv.parameters`; a copy."""
+        self._require_reset("reading the parameters")
         return self._envs.parameters.copy()
 
     @property
@@ -170,7 +175,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
     @property
     def stage_parameters(self) -> Array:
         """Parameters of each episode now, shape (num_envs, n_p), see `DQSpaceArmEnv.stage_parameters`."""
+        self._require_reset("reading the parameters")
         return self._envs.stage_parameters()
+
+    def _require_reset(self, what: str) -> None:
+        if not self._begun:
+            raise ResetNeeded(f"the episodes have not begun: call reset() before {what}")
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -292,8 +302,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             ValueError: If the actions have a wrong shape or a NaN; nothing has moved then.
         """
         resetting = self._over
-        if not self._begun:
-            raise ResetNeeded("the episodes have not begun: call reset() before step()")
+        self._require_reset("step()")
         if len(resetting) and self.autoreset_mode is AutoresetMode.DISABLED:
             raise ResetNeeded(
                 f"the episodes of sub-environments {resetting.tolist()} are over: "
@@ -333,8 +342,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             TypeError: If the increments are masked, or not of real numbers.
             ValueError: If the increments have a wrong shape, or are not finite.
         """
-        if not self._begun:
-            raise ResetNeeded("the episodes have not begun: call reset() before perturb()")
+        self._require_reset("perturb()")
         increments = real_array("increments", increments, np.float64)
         expected = self.num_envs, self.kernels.n_t
         if increments.shape != expected:
@@ -362,8 +370,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             TypeError: If the states are masked, or not of real numbers.
             ValueError: If the states have a wrong shape.
         """
-        if not self._begun:
-            raise ResetNeeded("the episodes have not begun: call reset() before observe()")
+        self._require_reset("observe()")
         x = self._envs.x if states is None else real_array("states", states)
         if x.shape != self._envs.x.shape:
             raise ValueError(f"states: shape {x.shape}, should be {self._envs.x.shape}")
@@ -383,8 +390,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             ResetNeeded: Before the first reset.
             ValueError: If there is no such sub-environment.
         """
-        if not self._begun:
-            raise ResetNeeded("the episodes have not begun: call reset() before get_state()")
+        self._require_reset("get_state()")
         chosen = self._checked_rows(rows)
         return {name: array[chosen] for name, array in self._kept().items()}
 
@@ -489,8 +495,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
                 'gymnasium.make_vec("DQSpaceArm-v0", render_mode="rgb_array")'
             )
             return None
-        if not self._begun:
-            raise ResetNeeded("call reset() before render()")
+        self._require_reset("render()")
         if self._renderer is None:
             from dq_space_arm_env.viewing.rendering import Renderer
 

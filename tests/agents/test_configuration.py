@@ -173,6 +173,10 @@ def test_the_algorithm_decides_about_the_class():
         ({"algorithm": {"name": "act", "validation_share": 1}}, "validation_share = 1.0: must be less"),
         ({"algorithm": {"name": "cloning", "optimization": {"update": 5}}}, "did you mean 'updates'"),
         ({"demonstrations": {"tolerance_scale": 2}}, "tolerance_scale = 2.0: must be at most 1"),
+        (
+            {"demonstrations": {"tolerance_scale": 0.5, "minari": "a/b-v0"}},
+            "tolerance_scale = 0.5: must be absent: existing demonstrations, here of minari, have",
+        ),
     ],
 )
 def test_wrong_values_for_imitation_are_named(changes, sentence):

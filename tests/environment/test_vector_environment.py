@@ -295,8 +295,15 @@ def test_bad_construction_is_refused():
             DQSpaceArmVectorEnv(2, autoreset_mode=mode)
     with pytest.raises(ValueError, match="render_mode: 'human'"):
         DQSpaceArmVectorEnv(2, render_mode="human")
-    with pytest.raises(ResetNeeded):
-        DQSpaceArmVectorEnv(2).step(np.zeros((2, 12)))
+
+
+def test_nothing_is_read_before_the_first_reset():
+    env = DQSpaceArmVectorEnv(2, "random-target")
+    for name in ("states", "parameters", "targets", "stage_parameters"):
+        with pytest.raises(ResetNeeded, match=r"call reset\(\) before reading"):
+            getattr(env, name)
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        env.step(np.zeros((2, 12)))
 
 
 def test_episodes_are_cut_off_by_single_environments_alone():
