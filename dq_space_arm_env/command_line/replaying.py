@@ -60,8 +60,8 @@ def show_maneuver(scene: Scene, page: Path, console: Console) -> str:
     flight = shown[0]
     verdict = "reaches the target" if flight.is_success else "MISSES the target"
     return (
-        f"{page}: the first maneuver {verdict}, {flight.attitude_error:.2g} degrees and "
-        f"{flight.position_error:.2g} m off; open it in a browser"
+        f"{page}: the first maneuver {verdict} at J = {flight.cost:.5g}, {flight.attitude_error:.2g} degrees "
+        f"and {flight.position_error:.2g} m off; open it in a browser"
     )
 
 
