@@ -7,6 +7,7 @@ equal data have equal cards.
 from __future__ import annotations
 
 from dataclasses import replace
+from math import isfinite
 from string import Template
 
 from dq_space_arm_env.common.shown_text import markdown_text
@@ -54,7 +55,7 @@ size_categories:
 
 # $demonstrations optimal maneuvers, scene $scene
 
-A spacecraft floats freely and moves so that the tip of its arm reaches a target pose and rests there. Each
+A spacecraft floats freely and moves so that the tip of its arm reaches a target pose. Each
 demonstration is a locally optimal maneuver from a random start, found by control-limited differential dynamic
 programming, with the feedback gains of the optimal policy around it: how to respond where an agent drifts
 off.
@@ -67,7 +68,7 @@ $contents
 `env.reset(seed=...)` draws starts from the spread of the scene, uniformly in each component. A problem is
 solved from the best of several guesses, and again where the policy of a neighbor, followed from its start,
 points to a cheaper minimum. A demonstration has converged, ends within the tolerances of the scene
-($attitude_tolerance deg, $position_tolerance m), and its actions, replayed in the environment, cost J.
+($tolerances),$catches and its actions, replayed in the environment, cost J.
 $failures
 
 ## Numbers
@@ -162,15 +163,16 @@ frame = dataset[0]  # observation.state, action, next.reward, next.done, ...
 def data_card(facts: Facts, minari_id: str | None = None, *, lerobot: bool = False) -> str:
     """Fill in the template; for a copy, the Minari data set of this name or a data set of LeRobot."""
     demonstrations, settings = facts.demonstrations, facts.demonstrations.settings
-    success, layout = demonstrations.scene.success, demonstrations.kernels.layout
+    scene, layout = demonstrations.scene, demonstrations.kernels.layout
+    tolerances = zip(scene.success.tolerances, ("deg", "m", "deg/s", "m/s"), strict=True)
     return _TEMPLATE.substitute(
-        scene=markdown_text(demonstrations.scene.name),
-        pretty_name=_pretty_name(demonstrations.scene.name),
+        scene=markdown_text(scene.name),
+        pretty_name=_pretty_name(scene.name),
         demonstrations=len(demonstrations),
         size_category=_size_category(len(demonstrations)),
         contents="\n\n".join(_contents(facts).markdown()),
-        attitude_tolerance=f"{success.attitude_error_deg:g}",
-        position_tolerance=f"{success.position_error:g}",
+        tolerances=", ".join(f"{largest:g} {unit}" for largest, unit in tolerances if isfinite(largest)),
+        catches=" has caught the payload," if any(phase.catch for phase in scene.phases) else "",
         failures=_failures(facts),
         at_tolerance=int(facts.at_tolerance.sum()),
         numbers=_numbers(facts),

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dq_space_arm_env import Scene
+from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.environment.rollouts import Rollout
 from experts import generate_demonstrations, load_demonstrations
@@ -193,6 +193,12 @@ def test_the_card_follows_from_the_data_alone(facts: Facts, folder: Path):
     assert "parameters" not in card
     assert facts.demonstrations.settings["source"] in card
     assert "| `feedback_gains` | (150, 6, 12) |" in card
+
+
+def test_the_card_names_every_tolerance(facts: Facts, monkeypatch: pytest.MonkeyPatch):
+    assert "(3 deg, 0.1 m), and its actions" in data_card(facts)
+    monkeypatch.setattr(facts.demonstrations, "scene", load_scene("capture-and-detumble"))
+    assert "(10 deg, 0.2 m, 0.2 deg/s, 0.005 m/s), has caught the payload, and its" in data_card(facts)
 
 
 def test_what_the_card_tells_to_do_works(
