@@ -155,9 +155,11 @@ def convergence_figure(
     done = np.concatenate([[0], history["iteration"]])
     marked = len(history) <= _MOST_MARKERS
     line, cross = (".-", "x--") if marked else ("-", "--")
-    costs = np.array([start_cost, *history["cost"]])
+    # The penalties of doing nothing are not known here: under constraints the first iteration comes first.
+    costs = np.array([start_cost if solution.constraints is None else np.nan, *history["cost"]])
     cost.semilogy(done, costs, line, color=BLUE)
-    is_wide = costs.max() > _WIDE * costs.min()  # with numbers between the powers of ten there would be none
+    # Whether the powers of ten alone number the axis: without numbers between them a short one has none.
+    is_wide = np.nanmax(costs) > _WIDE * np.nanmin(costs)
     cost.yaxis.set_major_locator(LogLocator(subs=(1.0,) if is_wide else (1.0, 2.0, 5.0)))
     cost.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     cost.yaxis.set_minor_formatter(NullFormatter())

@@ -139,6 +139,7 @@ def test_convergence_under_constraints_has_penalties(short_run: ManeuverRun) -> 
         solution.constraints = constraints
         cost = convergence_figure(solution, short_run.zero_control_cost, 1e-7, 1.0).axes[0]
         assert cost.get_ylabel() == label
+        assert np.isnan(cost.lines[0].get_ydata()[0]) == (constraints is not None)
 
 
 def test_snapshots_are_spread_over_the_motion(short_run: ManeuverRun) -> None:
