@@ -96,7 +96,7 @@ class Solver:
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         guess = layout.to_control(self._followed(demonstration, state, stage, rows), rows[:-1])
         solution = uninterrupted(BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows))
-        if solution.converged and problem.misses(solution.states[-1]) > 1.0:
+        if solution.converged and not problem.is_success(solution.states, solution.controls):
             within = BoxDDP(problem.constrained(RESERVE), initial_regularization=NEAR_REGULARIZATION)
             reached = uninterrupted(within.solve(x0=state, u_init=solution.controls, parameters=rows))
             solution = reached if reached.converged else solution  # too late to reach the target

@@ -348,11 +348,9 @@ class GuidedDDP:
         return self._constrained_solver
 
     def _is_good(self, solution: Solution) -> bool:
-        """Whether a solution has converged, and ends within the tolerances if the problem has any."""
-        if not solution.converged:
-            return False
-        misses: Callable[[FloatArray], float] | None = getattr(self.problem, "misses", None)
-        return misses is None or misses(solution.states[-1]) <= 1.0
+        """Whether a solution has converged, and is a success if the problem knows of any."""
+        succeeds: Callable[[FloatArray, FloatArray], bool] | None = getattr(self.problem, "is_success", None)
+        return solution.converged and (succeeds is None or succeeds(solution.states, solution.controls))
 
     def in_long_steps(
         self, coarsening: Sequence[int], *, second_order: str | None = None, after: Self | None = None

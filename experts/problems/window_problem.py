@@ -72,6 +72,6 @@ class WindowProblem:
         """See `carried_along`, with the present parameters."""
         return carried_along(self.maneuver.kernels.layout, states, parameters, self.parameters.rows)
 
-    def misses(self, state: FloatArray) -> float:
-        """See `ArmProblem.misses`; 0 for a window after which the maneuver continues."""
-        return 0.0 if self.ends_early else self.maneuver.misses(state)
+    def is_success(self, states: FloatArray, controls: FloatArray) -> bool:
+        """See `ArmProblem.is_success`; True for a window after which the maneuver continues."""
+        return self.ends_early or self.maneuver.is_success(states, controls)
