@@ -16,6 +16,7 @@ from agents.evaluation.conditions import CONDITIONS, as_known, scene_under
 from agents.evaluation.evaluating import Advance, Evaluation, evaluate
 from agents.evaluation.expert_costs import (
     EVALUATION_SEEDS,
+    STAGE,
     evaluation_seeds,
     optimal_costs,
     validation_costs,
@@ -273,7 +274,7 @@ class _Work:
             self.scene,
             episodes,
             self.executor,
-            lambda done, total: announced(Advance("optimal costs", done, total)),
+            lambda done, total: announced(Advance(STAGE, done, total)),
         )
         return None if np.isnan(found.cost).all() else float(np.nanmedian(found.cost))
 
@@ -329,7 +330,7 @@ class _Work:
             flown,
             n,
             executor=self.executor,
-            progress=lambda done, total: announced(Advance("optimal costs", done, total)),
+            progress=lambda done, total: announced(Advance(STAGE, done, total)),
         )
         if name == RECEDING:
             seconds = time_per_action(RecedingHorizon(known).policy(), flown)

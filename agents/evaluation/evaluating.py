@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from agents.configuration.schema import RESERVED_SEED
 from agents.evaluation.conditions import disturbance_under, scene_under
-from agents.evaluation.expert_costs import EVALUATION_SEEDS, OptimalCosts, evaluation_seeds, optimal_costs
+from agents.evaluation.expert_costs import (
+    EVALUATION_SEEDS,
+    STAGE,
+    OptimalCosts,
+    evaluation_seeds,
+    optimal_costs,
+)
 from agents.evaluation.statistics import Interval, bootstrap_interval, wilson_interval
 from agents.policies.flying import Flights, Policy, fly, from_json_list, json_list, time_per_action
 from agents.policies.policy_files import noted_effort
@@ -258,7 +264,7 @@ def evaluate(
             n,
             workers=workers,
             executor=executor,
-            progress=lambda done, total: progress(Advance("optimal costs", done, total)),
+            progress=lambda done, total: progress(Advance(STAGE, done, total)),
         )
     started = perf_counter()
     flights = fly_under(

@@ -24,6 +24,8 @@ EVALUATION_SEEDS = 500
 """Evaluation seeds of a scene."""
 GROUP = 25
 """Problems that are solved, compared with each other, and written together."""
+STAGE = f"optimal costs, {GROUP} at a time"
+"""Name of the work in messages on its progress."""
 
 
 class OptimalCosts(NamedTuple):
