@@ -11,6 +11,7 @@ from dq_space_arm_env.viewing.rendering import Renderer
 from dq_space_arm_env.viewing.rendering.body_shapes import corners_of, shape_meshes
 from dq_space_arm_env.viewing.rendering.solids import Mesh
 from dq_space_arm_env.viewing.rendering.spacecraft import LIKENESS, SpacecraftModel
+from dq_space_arm_env.viewing.replay.geometry import solids_of
 
 NO_TRAIL = np.zeros((0, 3))
 MAGENTA = "#ff00ff"
@@ -195,3 +196,21 @@ def test_a_base_alone_with_shapes_is_drawn():
     scene = Scene.model_validate(data)
     picture = Renderer(scene).draw(start_poses(scene), NO_TRAIL)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
+
+
+def test_goals_of_other_tips_have_axes_on_the_target_or_in_space():
+    place, shapes = np.array([0.3, 0.4, 0.5]), {}
+    for where, frame in (("target", 1), ("inertial", 3)):
+        changes = {"other_tips.0.relative_to": where, "other_tips.0.goal.position": place.tolist()}
+        scene = load_scene("dual-arm").replace(changes)
+        model = SpacecraftModel(scene)
+        corners = model.mesh.corners[model.mesh.frames == model.frame_count + frame]
+        assert np.linalg.norm(corners - place, axis=-1).min() < 1e-9  # where the arrows begin
+        shapes[where] = solids_of(scene).counts
+    arrows = shapes["inertial"][-1]
+    assert arrows > 0 == shapes["target"][-1]
+    assert shapes["target"][-3] == shapes["inertial"][-3] + arrows
+    start = start_poses(scene)
+    before = Renderer(scene).draw(start, NO_TRAIL)
+    moved = Renderer(scene.replace({"other_tips.0.goal.position": (place + 0.3).tolist()}))
+    assert (moved.draw(start, NO_TRAIL) != before).any()

@@ -27,7 +27,7 @@ def test_triangles_enclose_the_volume_of_the_mesh(name):
     normals = solids.normals[solids.triangles[:, 0], :3].astype(float)
     assert (np.einsum("ti,ti->t", normals, area) > 0.0).mean() > 0.999
     assert sum(solids.counts) == len(solids.triangles)
-    assert len(solids.counts) == SpacecraftModel(scene).frame_count + 3
+    assert len(solids.counts) == SpacecraftModel(scene).frame_count + 4
 
 
 def test_a_ball_is_shaded_round_and_a_box_is_not():

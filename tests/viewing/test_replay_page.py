@@ -112,7 +112,7 @@ def test_a_moving_target_and_its_body_are_in_the_data(make_flight, paper):
     np.testing.assert_array_equal(found, target.astype(np.float32))
     assert first["targetBody"] == target[5].tolist()
     assert (second["target"], second["targetBody"]) == (list(paper.target.pose.dual_quaternion), None)
-    assert data["solids"]["counts"][-2:] == [12, 0]  # triangles of a box
+    assert data["solids"]["counts"][-3:] == [12, 0, 0]  # triangles of a box
 
 
 def test_a_target_at_rest_and_no_shapes_cost_nothing(make_flight, paper):
@@ -149,7 +149,8 @@ def test_the_page_moves_target_body_and_payload_with_time(make_flight, paper, tm
         f'import {{ readRecording }} from "{BROWSER / "recording.mjs"}";\n'
         f'const {{ flights }} = readRecording(readFileSync("{tmp_path / "data.json"}", "utf-8"));\n'
         "for (const flight of flights) flight.moveTo(20.25 * 0.015);\n"
-        "console.log(JSON.stringify(flights.map((flight) => [[...flight.poses.slice(-32)], flight.aim])));"
+        "const shown = flights.map((flight) => [[...flight.poses.slice(-40, -8)], flight.aim]);\n"
+        "console.log(JSON.stringify(shown));"
     )
     printed = subprocess.run(["node", str(script)], check=True, capture_output=True, text=True).stdout
     (moved, aim), (rest, _) = json.loads(printed)

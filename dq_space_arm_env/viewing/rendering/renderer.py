@@ -98,7 +98,7 @@ class Renderer:
 
     def _faces(self, dual_quaternions: Array, trail: Array) -> Faces:
         """Faces of the solids and the trail."""
-        # After the robot's frames: those of the target, of its body and of the payload, and the inertial one.
+        # After the robot's frames those that `SpacecraftModel` numbers.
         payload = dual_quaternions[-1] if self._payload is None else self._payload
         frames = np.vstack([dual_quaternions, self._target, self._target_body, payload, np.eye(8)[0]])
         mesh = self._model.mesh

@@ -80,9 +80,9 @@ def frames_before(scene: Scene) -> tuple[list[int], Array]:
 class SpacecraftModel:
     """The solids of a scene.
 
-    Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The three numbers
-    after those stand for the target, which is where the tip should be, for the target's body, and for the
-    payload, whose frame is that of the tip that holds it.
+    Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The four numbers
+    after those stand for the target, which is where the tip should be, for the target's body, for the
+    payload, whose frame is that of the tip that holds it, and for the inertial frame.
 
     Attributes:
         scene: The scene.
@@ -412,10 +412,10 @@ class SpacecraftModel:
             yield from _arrows(tip, length, 0.26 * thickness, 0.0)
         yield from _arrows(self.frame_count, length, 0.42 * thickness, 0.5)
         for other in self.scene.other_tips:
-            if other.relative_to == "target":
-                rotation, place = np.array(other.goal.rotation_matrix), np.array(other.goal.position)
-                for arrow in _arrows(0, length, 0.42 * thickness, 0.5):
-                    yield arrow.moved(self.frame_count + 1, rotation, place)
+            frame = self.frame_count + (1 if other.relative_to == "target" else 3)
+            rotation, place = np.array(other.goal.rotation_matrix), np.array(other.goal.position)
+            for arrow in _arrows(0, length, 0.42 * thickness, 0.5):
+                yield arrow.moved(frame, rotation, place)
 
 
 def _arrows(frame: int, length: float, radius: float, lightness: float) -> Iterator[Mesh]:

@@ -68,10 +68,10 @@ class View(NamedTuple):
 def solids_of(scene: Scene) -> Triangles:
     """Solids of the environment's pictures, with smooth shading where they are round.
 
-    The groups are the frames, in the end those of target, target's body and payload.
+    The groups are the frames, in the end those of target, target's body and payload, and the inertial one.
     """
     model = SpacecraftModel(scene)
-    return _triangles_of(model.mesh, model.frame_count + 3, f"scene {scene.name!r}")
+    return _triangles_of(model.mesh, model.frame_count + 4, f"scene {scene.name!r}")
 
 
 def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDrawing | None:
@@ -168,7 +168,7 @@ def view_of(flights: Sequence[ShownFlight], scene: Scene) -> View:
     model = SpacecraftModel(scene)
     frames = [_frames_at(flight) for flight in flights]
     origins = [np.moveaxis(np.array(poses.position(tuple(np.moveaxis(f, 2, 0)))), 0, 2) for f in frames]
-    robots, goals = [origin[:, :-3] for origin in origins], np.stack([origin[:, -3] for origin in origins])
+    robots, goals = [origin[:, :-4] for origin in origins], np.stack([origin[:, -4] for origin in origins])
     if scene.base.motion == "planar":
         azimuth, elevation = _PLANAR_VIEW
     else:
@@ -179,11 +179,11 @@ def view_of(flights: Sequence[ShownFlight], scene: Scene) -> View:
 
 
 def _frames_at(flight: ShownFlight) -> FloatArray:
-    """Frames of robot, target, its body and payload at some instants, shape (instants, frames + 3, 8)."""
+    """All frames that `SpacecraftModel` numbers, at some instants, shape (instants, frames + 4, 8)."""
     instants = np.linspace(0, flight.steps, _INSTANTS).astype(int)
     body = flight.target if flight.target_body is None else flight.target_body
     payload = flight.frames[:, -1] if flight.payload is None else flight.payload
-    others = [poses_at(each, instants)[:, None] for each in (flight.target, body, payload)]
+    others = [poses_at(each, instants)[:, None] for each in (flight.target, body, payload, np.eye(8)[0])]
     return np.concatenate([flight.frames[instants], *others], axis=1)
 
 

@@ -18,7 +18,7 @@ export function readRecording(text) {
   }
   if (constraints) for (const name of ["violated", "broken", "gas"]) constraints[name] = constraints[name].map(array);
   view.points = array(view.points);
-  const frameCount = solids.counts.length - 3; // the last three are those of the target, of its body, of the payload
+  const frameCount = solids.counts.length - 4; // the last are those of target, its body, payload and inertial frame
   const poses = (place) => (place && !Array.isArray(place) ? array(place) : place);
   const flights = data.flights.map((flight) => {
     const [target, targetBody, payload] = [flight.target, flight.targetBody, flight.payload].map(poses);
@@ -38,9 +38,10 @@ export class Flight {
   constructor(description, frameCount) {
     Object.assign(this, description); // label, steps, dt, note, verdict, target, targetBody, payload, frames
     this.frameCount = frameCount;
-    // The poses of the target, of its body and of the payload come after the robot's.
-    this.poses = new Float32Array(8 * (frameCount + 3));
-    const others = [this.target, this.targetBody ?? this.target, this.payload ?? this.frames.slice(-8)];
+    // The poses of target, its body, payload and inertial frame come after the robot's.
+    this.poses = new Float32Array(8 * (frameCount + 4));
+    const inertial = [1, 0, 0, 0, 0, 0, 0, 0];
+    const others = [this.target, this.targetBody ?? this.target, this.payload ?? this.frames.slice(-8), inertial];
     this.others = others.map((source, index) => ({
       source, // a pose, or one for each instant
       poses: this.poses.subarray(8 * (frameCount + index), 8 * (frameCount + index + 1)),

@@ -38,11 +38,12 @@ export class Renderer {
       grid: this.program(GRID_SHADERS),
       sky: this.program(SKY_SHADERS),
     };
-    // Frame by frame: where its triangles begin, and how many there are; the last three frames are those of the
-    // target, of its body and of the payload.
+    // Frame by frame: where its triangles begin, and how many there are; the last four frames are those of target,
+    // its body and payload, and the inertial one, in which goals of other tips may be.
     this.parts = partsOf(solids.counts);
-    this.targetParts = this.parts.slice(-3, -1);
-    this.robotParts = [...this.parts.slice(0, -3), ...this.parts.slice(-1)];
+    const [target, body, payload, goals] = this.parts.slice(-4);
+    this.targetParts = [target, body, goals];
+    this.robotParts = [...this.parts.slice(0, -4), payload];
     this.robot = this.solid(solids);
     if (constraints) {
       this.constraints = this.solid(constraints);
@@ -56,7 +57,7 @@ export class Renderer {
     }
     const bubble = ball(scene.tolerance);
     this.bubble = this.solid(bubble);
-    this.bubbleParts = [{ frame: this.parts.length - 3, start: 0, count: bubble.triangles.length / 3 }];
+    this.bubbleParts = [{ frame: this.parts.length - 4, start: 0, count: bubble.triangles.length / 3 }];
     this.ribbons = flights.map((flight) => {
       const { positions, directions, places, vertexCount } = ribbon(flight);
       return {
