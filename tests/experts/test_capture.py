@@ -65,6 +65,19 @@ def test_an_end_within_the_tolerances_is_no_success_without_the_catch() -> None:
         assert not problem.is_success(np.full((6, env.kernels.n_x), np.nan), controls[7:])
 
 
+@pytest.mark.slow
+def test_long_steps_leave_open_whether_a_catch_is_met() -> None:
+    lengths = {f"phases.{index}.steps": steps for index, steps in enumerate((1, 1, 10))}
+    wide, narrow = ({"attitude_error_deg": 180.0, "position_error": most} for most in (180.0, 1e-6))
+    scene = dq_space_arm_env.load_scene("capture-and-detumble")
+    changes = {**lengths, "simulation.steps": 12, "success": wide, "phases.2.catch": narrow}
+    problem = ArmProblem(scene.replace(changes))
+    states = np.tile(problem.initial_state, (13, 1))
+    controls = np.zeros((12, problem.n_controls))
+    assert not problem.is_success(states, controls)
+    assert problem.coarsened(2).is_success(states[::2], controls[::2])
+
+
 def test_a_problem_loads_no_environment() -> None:
     code = (
         "import sys, experts.problems.arm_problem; assert 'dq_space_arm_env.environment' not in sys.modules"
