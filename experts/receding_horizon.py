@@ -47,8 +47,8 @@ class RecedingHorizonExpert:
 
     Observations of `DQSpaceArm-v0` reveal the stage by the time left; the first one, and any with no less
     time left than the last, begins a new episode. States do not reveal it: calls are counted, and `reset`
-    begins an episode. A state has n_x entries, an observation n_obs, one more, or 13 more where the target
-    moves. Poses are normalized.
+    begins an episode. The two are told apart by their lengths: an observation has more entries, n_obs, than a
+    state, n_x. Poses are normalized.
 
     A measurement that is no state, with numbers that are not finite or a zero quaternion, is an error where
     an episode begins. Within an episode the expert flies on: the state that its last solution predicts for

@@ -86,8 +86,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     ## Action Space
 
-    A `Box(-1, 1, (12,), float32)`: inputs as fractions of their limits, constant over a time step. Values beyond the bounds are clipped; NaN raises an
-    error. A float64 action is used at full precision. `env.unwrapped.kernels.layout` converts: `to_control(action)`, `to_action(control)`.
+    A `Box(-1, 1, (12,), float32)`: inputs as fractions of their limits, which have to be finite, constant over a time step. Values beyond the bounds are
+    clipped; NaN raises an error. A float64 action is used at full precision. `env.unwrapped.kernels.layout` converts: `to_control(action)`, `to_action(control)`.
 
     | Num | Action                                                 | Min  | Max | Unit  | Limit at 1 |
     |-----|--------------------------------------------------------|------|-----|-------|------------|
@@ -136,7 +136,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | number of the phase, from 0                                       | there are phases                               |          |
     | pose of the target, q_{D/I}                                       | `target.observed`                              | 1, m     |
     | masses, relative change                                           | `spread.observed`                              |          |
-    | error dual quaternions of other tips, scalar part at least 0      | they have goals                                | 1, m     |
+    | error dual quaternions of other tips, scalar part at least 0      | there are `other_tips`                         | 1, m     |
     | margins of constraints, tanh(-c / scale)                          | constraints have `observed`                    |          |
 
     Actions follow in this order: base force, base torque, joint torques, wrist rates, torques of wheels, forces of thrusters. An action below 0
@@ -168,7 +168,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     `info` also holds the `attitude_error` [deg] and `position_error` [m] of the tip (of several the worst), `is_success` (both within the scene's tolerances, 3 deg and 0.1 m) and
     `diverged`; where the target moves, or success asks for it, the tip's `angular_velocity_error` [deg/s] and `velocity_error` [m/s] relative to the target with the
-    wrist held. `reset` returns the same keys, with costs of zero; where target, masses or anything else vary, its `info["parameters"]` has their
+    wrist held. In a scene with phases it holds the `phase` of the next step, counted from 0; where something is caught `caught`, 1 unless the catch has failed, and in
+    the step of the catch the impulse on the payload, `shock` [N s] and `angular_shock` [N m s]. `reset` returns the same keys, with costs of zero; where target, masses or anything else vary, its `info["parameters"]` has their
     values in this episode by name.
 
     Where a scene has constraints, `info["constraints"]` has every residual by its name, which is at most 0 where the constraint holds, of the state after
@@ -178,11 +179,18 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     ## Starting State
 
     `reset(seed=...)` draws the initial state from the scene's spread, uniformly per component, and the target, masses and inertias where they have a spread
-    (scenes `random-target` and `random-masses`). `options={"nominal": True}` starts at the scene's initial state, `options={"initial_state": x}` at a state x
-    (`env.unwrapped.kernels.layout.state` names its entries); both keep target and masses nominal. `options={"target": q}`, alone or with either,
-    sets the target of a scene in which it varies (at the start if it moves; its velocity in its own axes stays), `options={"parameters": p}` all that varies (`kernels.parameters` names its entries). `options={"state": s}` goes on in the middle of an episode, where `s = env.unwrapped.get_state()` was called, to the
-    same bits; `copy.deepcopy` and `pickle` keep a running episode likewise. `env.unwrapped.episode_scene` is the scene of the running episode with everything drawn or given as plain numbers:
-    what an optimal controller may know.
+    (scenes `random-target` and `random-masses`). `reset(options=...)` gives what is not to be drawn:
+
+    | Option                 | Meaning                                                                                                                    |
+    |------------------------|----------------------------------------------------------------------------------------------------------------------------|
+    | `{"nominal": True}`    | the scene's initial state, target and masses                                                                               |
+    | `{"initial_state": x}` | a state x, entries as in `env.unwrapped.kernels.layout.state`; target and masses are nominal                               |
+    | `{"target": q}`        | the target of a scene in which it varies, alone or with the others (at the start if it moves; its velocity in its own axes stays) |
+    | `{"parameters": p}`    | all that varies besides the state, entries as in `env.unwrapped.kernels.parameters`, likewise                              |
+    | `{"state": s}`         | alone: the middle of an episode, where `s = env.unwrapped.get_state()` was called; it goes on to the same bits             |
+
+    `copy.deepcopy` and `pickle` keep a running episode likewise. `env.unwrapped.episode_scene` is the scene of the running episode with everything drawn or
+    given as plain numbers: what an optimal controller may know.
 
     ## Episode End
 
@@ -221,7 +229,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     `DQSpaceArmVectorEnv` steps many sub-environments with one call of vectorized machine code, bit-equal to single environments with the same seeds.
     After the end of an episode the next step resets (`autoreset_mode="NextStep"`), or the same step (`"SameStep"`, with `final_obs` and `final_info`), or the
     caller (`"Disabled"`). `reset(seed=s)` seeds copy i with s + i; `options={"reset_mask": mask}` resets some, and `initial_state`, `target` and `parameters`
-    may have a row for each. `truncated` is always false; `max_episode_steps` is refused: set `simulation.steps`. `perturb(increments)` pushes the states.
+    may have a row for each. `truncated` is always false; `max_episode_steps` is refused: set `simulation.steps`. `threads=2` shares the copies of a step between two
+    cores. `perturb(increments)` pushes the states; `get_state(rows)` and `set_state(state, rows)` save and put back some episodes.
 
     ```python
     >>> venv = gymnasium.make_vec("DQSpaceArm-v0", num_envs=3)
