@@ -203,7 +203,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     A step is divided where it would err by more than the scene's `simulation.tolerance` (1e-3 rad or m by default): motions too fast for the time step stay
     sound, and slow ones cost an estimate. `info["step_error"]` is that estimate in units of the tolerance, 0 after a reset, NaN where nothing estimates it (`tolerance: off`, or a method
-    without an embedded one, or a step that is given up: the simulation diverged). Many accurate steps of a chaotic motion may still end elsewhere: `env.unwrapped.kernels.numerical_error(states, controls)` tells.
+    without an estimate, or a step that is given up: the simulation diverged). Many accurate steps of a chaotic motion may still end elsewhere: `env.unwrapped.kernels.numerical_error(states, controls)` tells.
 
     ## Arguments
 
