@@ -23,6 +23,7 @@ from agents.zoo import list_policies
 from agents.zoo.shelf import policy_file
 from dq_space_arm_env.command_line.verb import DefaultGroup
 from dq_space_arm_env.scene.constraints import Constraint, Plume
+from dq_space_arm_env.task.step_report import grouped, report_names
 from dq_space_arm_env.validation import parse_yaml
 
 ROOT = Path(__file__).parent.parent
@@ -198,6 +199,14 @@ def test_every_number_of_a_scene_has_a_unit():
         if keys.holds_numbers(field) and not keys.units_of(field)
     }
     assert without == DIMENSIONLESS
+
+
+def test_the_page_of_the_environment_names_every_key_of_info():
+    scenes = [dq_space_arm_env.load_scene(name) for name in dq_space_arm_env.list_scenes()]
+    found = {key for scene in scenes for key in grouped(dict.fromkeys(report_names(scene)[1:]))}
+    assert {"phase", "caught", "shock", "cost", "constraints", "cost_tip_twist"} <= found
+    text = TEXTS["environment"].partition("## DQSpaceArmGoal-v0")[0]
+    assert {key for key in found if f"`{key}`" not in text and f'`info["{key}"]`' not in text} == set()
 
 
 def test_tables_of_keys_are_complete():
