@@ -153,7 +153,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     |-------------------------------|--------------------------------------------------------|--------------------------------------|
     | `cost_pose`                   | (q_{G/I} - q_{D/I})' W (q_{G/I} - q_{D/I})             | 15                                   |
     | `cost_base_velocity`          | (omega - omega_D)' W (omega - omega_D), 6 components   | 1                                    |
-    | `cost_control`                | u' R u, in N, N m, rad/s                               | 10 force, 1 torque, 0.01 joints, 0.1 wrist |
+    | `cost_control`                | u' R u, in N, N m, rad/s, after clipping by actuators  | 10 force, 1 torque, 0.01 joints, 0.1 wrist |
     | `terminal_cost_pose`          | as `cost_pose`, at the end; 0 before                   | 150                                  |
     | `terminal_cost_base_velocity` | as `cost_base_velocity`, at the end; 0 before          | 1                                    |
 
@@ -166,8 +166,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | `cost_tip_twist`              | w' W w, w the relative twist with the wrist's rates    | the scene's `cost.tip_twist`         |
     | `terminal_cost_tip_twist`     | the same at the end, with the wrist held; 0 before     | `cost.terminal_tip_twist`: 1e5 in `tracking` |
 
-    `info` also holds the `attitude_error` [deg] and `position_error` [m] of the tip (of several the worst), `is_success` (both within the scene's tolerances, 3 deg and 0.1 m) and
-    `diverged`; where the target moves, or success asks for it, the tip's `angular_velocity_error` [deg/s] and `velocity_error` [m/s] relative to the target with the
+    `info` also holds the `attitude_error` [deg] and `position_error` [m] of the tip (of several the worst), `is_success` (all errors within the scene's tolerances, here 3 deg and 0.1 m, and no
+    catch has failed) and `diverged`; where the target moves, or success asks for it, the tip's `angular_velocity_error` [deg/s] and `velocity_error` [m/s] relative to the target with the
     wrist held. In a scene with phases it holds the `phase` of the next step, counted from 0; where something is caught `caught`, 1 unless the catch has failed, and in
     the step of the catch the impulse on the payload, `shock` [N s] and `angular_shock` [N m s]. `reset` returns the same keys, with costs of zero; where target, masses or anything else vary, its `info["parameters"]` has their
     values in this episode by name.
