@@ -419,7 +419,7 @@ class Scene(Model):
             raise SceneError(f"{origin}: {error}") from error
 
     def to_yaml(self, path: str | Path | None = None) -> str:
-        """Write the scene with every default filled in; loading it gives an equal scene.
+        """Write the scene with defaults, but for parts that it lacks; loading it gives an equal scene.
 
         Args:
             path: File to write, besides returning the text; nothing is written when None.

@@ -89,11 +89,14 @@ def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:
     charge = [charged(scene, residuals, at_end=0.0)[0]] if scene.constraints else []
     last = [*errors, *catching, 0.0, *charge, *residuals]
     costs = [0.0] * (len(report_names(scene)) - len(last))
+    success = is_success(scene, errors)
+    if catching:
+        success = casadi.logic_and(success, catching[0])
     return {
         "memory_kept": [memory[0], *equations.state_cost_terms(x), *rest],
         "observation": view["observation"],
         "report": [*costs, *last],
-        "flags": [0.0, is_success(scene, errors), 0.0],
+        "flags": [0.0, success, 0.0],
     }
 
 

@@ -219,7 +219,9 @@ def test_a_start_has_the_sign_of_the_first_phases_target() -> None:
 
 
 def test_a_catch_outside_the_tolerances_fails() -> None:
-    scene = shortened("capture-and-detumble").replace({"phases.2.catch.position_error": 0.01})
+    names = ("attitude_error_deg", "position_error", "angular_velocity_error_deg", "velocity_error")
+    changes = {"phases.2.catch.position_error": 0.01, "success": dict.fromkeys(names, 1e4)}
+    scene = shortened("capture-and-detumble").replace(changes)
     env = gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped
     env.reset(options={"nominal": True})
     still, start = np.zeros(env.action_space.shape), scene.staged.starts[2]
@@ -229,6 +231,8 @@ def test_a_catch_outside_the_tolerances_fails() -> None:
         assert info["caught"] == (stage + 1 < start)
         assert info["shock"] == 0.0
     assert not info["is_success"]
+    _, seen = env.reset(options={"state": env.get_state()})
+    assert (seen["caught"], seen["is_success"]) == (0.0, False)
     assert env.stage_parameters[env.kernels.parameters.names.index("payload.mass")] == 0.0
     # Nothing is held: the free robot moves on.
     assert (
