@@ -153,7 +153,7 @@ class Evaluation:
             "median_cost_gap": known_interval(self.median_cost_gap),
             "tail_cost_gap": known_interval(self.tail_cost_gap),
             "unknown_optima": int(np.isnan(self.cost_gaps).sum()),
-            "cheaper_than_expert": int((flights.is_success & (self.cost_gaps < -CHEAPER)).sum()),
+            "cheaper_than_expert": int((self.valid_cost_gaps < -CHEAPER).sum()),
             "expert_success_rate": None
             if self.optimal is None
             else list(wilson_interval(int(self.optimal.is_success.sum()), len(self.seeds))),

@@ -192,6 +192,11 @@ def test_violations_have_intervals_and_columns():
     half = 1.96 * np.std(shares) / math.sqrt(40)  # of the normal approximation
     assert (mean - low, high - mean) == pytest.approx((half, half), rel=0.15)
     assert "violating" in str(evaluation_table([evaluation]).headings)
+    # What leaves the limits may cost less than the optimum within them: no better optimum is known for that.
+    flights = evaluation.flights._replace(is_success=np.ones(40, dtype=np.bool_))
+    dearer = OptimalCosts(evaluation.seeds, 1.01 * flights.cost, np.ones(40, dtype=np.bool_), np.zeros(40))
+    cheaper = dataclasses.replace(evaluation, flights=flights, optimal=dearer).summary()
+    assert cheaper["cheaper_than_expert"] == 40 - np.count_nonzero(shares)
     plain = evaluate(gentle, SHORT, 2, expert=False)
     assert plain.summary()["violating_episodes"] is plain.summary()["constraint_violations"] is None
     assert "violat" not in str(evaluation_table([plain]).headings)
