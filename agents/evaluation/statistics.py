@@ -132,6 +132,9 @@ def gap_over_runs(gaps: Sequence[ArrayLike]) -> Interval:
 
     Args:
         gaps: Cost gaps of each run, shape (n,), the same starts in all runs; NaN where unknown.
+
+    Raises:
+        ValueError: If they have another shape.
     """
     gap = _known(gaps)
     if gap.size == 0:
@@ -153,9 +156,10 @@ def probability_of_improvement(costs: ArrayLike, others: ArrayLike) -> Interval:
         others: J of the other agent from the same starts, shape (its runs, n), dimensionless.
 
     Raises:
-        ValueError: If the numbers of starts differ, or are zero.
+        ValueError: If a shape is another, or the numbers of starts differ or are zero.
     """
-    mine, theirs = (np.nan_to_num(np.asarray(each, float), nan=np.inf) for each in (costs, others))
+    found = (_by_run(each, "costs") for each in (costs, others))
+    mine, theirs = (np.where(np.isnan(each), np.inf, each) for each in found)
     if mine.shape[-1] != theirs.shape[-1]:
         raise ValueError(f"flights from {mine.shape[-1]} and {theirs.shape[-1]} starts: should be the same")
     mine, theirs = mine[:, None], theirs[None]
@@ -168,6 +172,9 @@ def performance_profile(gaps: Sequence[ArrayLike], thresholds: ArrayLike) -> lis
     Args:
         gaps: Cost gaps of each run, shape (n,), the same starts in all runs; NaN where unknown.
         thresholds: Cost gaps, shape (k,), dimensionless.
+
+    Raises:
+        ValueError: If the gaps have another shape.
     """
     known = _known(gaps)
     return [rate_over_runs(known <= threshold) for threshold in np.asarray(thresholds)] if known.size else []
@@ -185,8 +192,16 @@ def student_quantile(freedom: int) -> float:
 
 def _known(gaps: Sequence[ArrayLike]) -> FloatArray:
     """Gaps (runs, starts) from the starts whose gap is known in all runs."""
-    values = np.array(gaps, dtype=np.float64)
+    values = _by_run(gaps, "gaps")
     return values[:, ~np.isnan(values).any(axis=0)]
+
+
+def _by_run(values: ArrayLike | Sequence[ArrayLike], name: str) -> FloatArray:
+    """Numbers of shape (runs, starts); ValueError for another shape."""
+    found = np.array(values, dtype=np.float64)
+    if found.ndim != 2:
+        raise ValueError(f"{name}: shape {found.shape}, should be (runs, starts): put one run into a list")
+    return found
 
 
 def _crossed(scores: FloatArray) -> tuple[float, float, float]:

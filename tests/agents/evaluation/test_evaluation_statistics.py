@@ -123,8 +123,21 @@ def test_improvement_is_counted_start_by_start():
     assert back == pytest.approx((1 - value, 1 - high, 1 - low))
     even = probability_of_improvement(np.ones((3, 500)), np.full((3, 500), 1.0 + 1e-9))
     assert even.value == 0.5
+    assert probability_of_improvement([[np.inf]], [[np.nan]]).value == 0.5
     with pytest.raises(ValueError, match="flights from 4 and 3 starts"):
         probability_of_improvement(costs, [[1.0, 2.0, 3.0]])
+
+
+def test_a_single_run_that_is_no_list_of_runs_is_refused():
+    """Its flights would meet those from all other starts."""
+    costs, single = [[1.0, 2.0, 3.0]], [2.0, 3.0, 4.0]
+    for call in (
+        lambda: probability_of_improvement(single, costs),
+        lambda: probability_of_improvement(costs, single),
+        lambda: performance_profile(single, [0.1]),
+    ):
+        with pytest.raises(ValueError, match=r"shape \(3,\), should be \(runs, starts\)"):
+            call()
 
 
 def test_improvement_over_a_twin_is_as_likely_as_not():
