@@ -166,7 +166,8 @@ def compare(
         SceneError: If the scene cannot be loaded.
         PolicyError, PolicyFileError: If a policy is of no known kind, does not fit the scene, or cannot be
             read.
-        ValueError: If an argument is out of range or unknown, or the scene does not suit demonstrations.
+        ValueError: If an argument is out of range or unknown, the scene does not suit demonstrations, or a
+            condition does not suit the scene.
         DemonstrationsError: If processes are killed again and again; finished rows remain.
         KeyboardInterrupt: If the user interrupts it; likewise.
     """
@@ -174,6 +175,8 @@ def compare(
     _check("conditions", conditions, CONDITIONS)
     conditions = tuple(dict.fromkeys(conditions))
     given = load_scene(scene)
+    for condition in conditions:
+        scene_under(given, condition)  # refuses one that the scene cannot have, before hours of work
     evaluation_seeds(given, n)  # refuses a wrong n
     if not isinstance(receding_starts, int | np.integer) or receding_starts < 1:
         raise ValueError(f"receding_starts: {receding_starts!r}, should be a whole number of at least 1")

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dq_space_arm_env import Scene
-from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances, load_place
+from dq_space_arm_env import Scene, SceneError
+from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances, load_numbers, load_place
 
 WIDER = 1.5
 """Factor of the spread of starts."""
@@ -56,13 +56,17 @@ def scene_under(scene: Scene, condition: str) -> Scene:
         The scene to evaluate in.
 
     Raises:
-        ValueError: If the condition is unknown, or the scene has no mass to change.
+        ValueError: If the condition is unknown, the scene has no mass to change or phases that change it, or
+            is no valid one with the change.
     """
     if condition not in _CHANGES:
         raise ValueError(f"condition: {condition!r} is unknown; choose from {', '.join(CONDITIONS)}")
     if condition == "training":
         return scene
-    return _CHANGES[condition](scene).replace(name=f"{scene.name}, {condition}")
+    try:
+        return _CHANGES[condition](scene).replace(name=f"{scene.name}, {condition}")
+    except SceneError as error:
+        raise ValueError(f"condition: {condition!r} does not suit scene {scene.name!r}: {error}") from error
 
 
 def as_known(scene: Scene, condition: str) -> Scene:
@@ -141,6 +145,12 @@ def _with_load(factor: float) -> Callable[[Scene], Scene]:
         place = load_place(scene)
         if place is None:
             raise ValueError(f"scene {scene.name!r} has its tip on the base: no load can be changed")
+        if scene.phases and scene.payload is None:  # a payload is held as it is, or not at all
+            staged = [each.name for each in load_numbers(scene) if each.name in scene.staged.values]
+            if staged:
+                raise ValueError(
+                    f"scene {scene.name!r} has phases that change {staged[0]}: no load is scaled"
+                )
         load = scene.payload or scene.links[scene.tip_body - 1]
         inertia = (factor * np.array(load.inertia)).tolist()
         return scene.replace({f"{place}.mass": factor * load.mass, f"{place}.inertia": inertia})

@@ -20,7 +20,7 @@ from agents.evaluation.comparison_tables import (
     record,
     remarks,
 )
-from agents.evaluation.conditions import CONDITIONS
+from agents.evaluation.conditions import CONDITIONS, scene_under
 from agents.evaluation.evaluating import Advance, evaluate
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.plan_followers import CONTROLLERS
@@ -72,7 +72,10 @@ def evaluate_policies(
     given = load_scene(scene or scene_of(acting))
     for each in acting:
         check_fit(each, given)
-    for condition in CONDITIONS if ALL in conditions else dict.fromkeys(conditions):
+    chosen = CONDITIONS if ALL in conditions else tuple(dict.fromkeys(conditions))
+    for condition in chosen:
+        scene_under(given, condition)  # refuses one that the scene cannot have before anything flies
+    for condition in chosen:
         evaluations = []
         with progress_bar() as show:
             for number, policy in enumerate(acting, 1):

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.configuration import AgentConfiguration, list_configurations
 from agents.evaluation.comparing import Row, compare
+from agents.evaluation.conditions import scene_under
 from agents.evaluation.evaluating import Advance as Step
 from agents.evaluation.evaluating import known_interval
 from agents.evaluation.plan_followers import CONTROLLERS
@@ -168,11 +169,15 @@ def run_suite(
         SuiteError: If the suite or a task is not what it should be, two entrants have one name, or nobody can
             fly.
         ConfigurationError, PolicyError, PolicyFileError: If an entrant cannot be used.
+        ValueError: If a condition does not suit a task.
         DemonstrationsError: If processes of the expert are killed again and again; finished rows remain.
         KeyboardInterrupt: If the user interrupts it; likewise.
     """
     chosen = load_suite(suite)
     scenes = {task: chosen.scene(task) for task in tasks or chosen.tasks}
+    for scene in scenes.values():
+        for condition in chosen.conditions:
+            scene_under(scene, condition)  # refuses one that the scene cannot have before anybody flies
     if not entrants and not policies:
         entrants = (*CONTROLLERS, *chosen.agents, ZOO)
     controllers, agents, files = _sorted_out(entrants, chosen)

@@ -7,21 +7,25 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+from rich.console import Console
 
-from agents import evaluate
+from agents import compare, evaluate
 from agents.evaluation import CONDITIONS, EVALUATION_SEEDS, evaluation_seeds, fly, optimal_costs, scene_under
 from agents.evaluation.comparison_tables import evaluation_table, remarks
 from agents.evaluation.conditions import FlightDisturbance, physics_hash
 from agents.evaluation.evaluating import Evaluation, fly_under
+from agents.evaluation.evaluation_verbs import evaluate_policies
 from agents.evaluation.expert_costs import OptimalCosts
 from agents.evaluation.statistics import wilson_interval
 from agents.policies import ExportedPolicy
 from agents.policies.flying import time_per_action
+from agents.suite import load_suite, run_suite
 from agents.zoo.finding import PolicyError, as_policy, check_fit
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import rollout
+from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.task.step_report import n_observations
 from experts.demonstrations import SerialExecutor, generate_demonstrations
 from experts.demonstrations.settings import Settings
@@ -233,6 +237,38 @@ def test_conditions_change_what_they_say():
     assert scene_under(carrying, "heavy_payload").links == carrying.links
     with pytest.raises(ValueError, match="condition: 'rain' is unknown; choose from training, wide_starts"):
         scene_under(PAPER, "rain")
+
+
+def test_a_load_is_changed_in_all_phases_or_not_at_all():
+    scene = load_scene("capture-and-detumble")
+    masses, heavier = (
+        each.staged.values["payload.mass"] for each in (scene, scene_under(scene, "heavy_payload"))
+    )
+    assert heavier == pytest.approx(1.3 * np.array(masses))
+    phases = [phase.model_dump(exclude_unset=True) for phase in load_scene("refuelling").phases]
+    phases[1]["changes"]["links.2.mass"] = 7.0
+    with pytest.raises(ValueError, match=r"phases that change links\.2\.mass: no load"):
+        scene_under(load_scene("refuelling").replace(phases=phases), "heavy_payload")
+
+
+def test_a_condition_that_does_not_suit_the_scene_is_refused_before_anything_flies(monkeypatch, tmp_path):
+    """Whoever evaluates, and wherever among the conditions it stands."""
+    for module in ("evaluation_verbs", "comparing"):
+        monkeypatch.setattr(f"agents.evaluation.{module}.evaluate", lambda *_, **__: pytest.fail("flown"))
+    monkeypatch.setattr("agents.evaluation.comparing.fly_plans", lambda *_, **__: pytest.fail("flown"))
+    scene, refusal = (
+        load_scene("wheel-saturation"),
+        "condition: 'spin' does not suit scene 'wheel-saturation'",
+    )
+    policy = exported(n_observation=n_observations(scene), n_action=StateLayout.of(scene).n_u)
+    policy.save(tmp_path / "policy.npz")
+    with pytest.raises(ValueError, match=refusal):
+        compare([tmp_path], scene, 2, controllers=("gains",), conditions=("training", "spin"))
+    with pytest.raises(ValueError, match=refusal):
+        evaluate_policies(Console(), [str(tmp_path)], "wheel-saturation", 2, conditions=["all"])
+    suite = load_suite()
+    with pytest.raises(ValueError, match=refusal):
+        run_suite(["gains"], suite.model_copy(update={"conditions": ("training", "spin")}), out=tmp_path)
 
 
 def test_a_delayed_action_acts_steps_later():
