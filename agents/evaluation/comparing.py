@@ -46,6 +46,7 @@ from agents.evaluation.training_runs import (
 )
 from agents.policies.flying import time_per_action
 from agents.zoo.finding import ActingPolicy, as_policy, check_fit, policy_path
+from agents.zoo.onnx_model import tensor_files
 from agents.zoo.shelf import file_hash
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations.settings import software
@@ -243,7 +244,9 @@ class _Work:
             return evaluation, 0.0
 
         path = file if isinstance(file, Path) else None
-        content = {"policy": file_hash(path) if path and path.is_file() else None}
+        content: dict[str, Any] = {"policy": file_hash(path) if path and path.is_file() else None}
+        if path and path.suffix == ".onnx":
+            content["tensors"] = [file_hash(file) for file in tensor_files(path)]
         content |= self._common(condition, self.n)
         content["agents"] = agents_source((*PLAN_SOURCES, "zoo"))  # how a file becomes a policy
         if normalize is not None:

@@ -5,6 +5,8 @@ A file holds operators and numbers, no code.
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+
+
+_PLACE = re.compile(rb"\x08location\x12([\x01-\x7f])", re.DOTALL)  # and the length of the name that follows
 
 
 class OnnxModelError(ValueError):
@@ -56,18 +61,32 @@ class OnnxModel:
             raise OnnxModelError(
                 f"{path}: maps {found}, should map floats of shape (B, n_obs) to floats of shape (B, n_u)"
             )
-        self._name, self._dtype, self._batch = seen.name, _TYPES[seen.type], seen.shape[0]
+        self._path, self._name, self._dtype, self._batch = path, seen.name, _TYPES[seen.type], seen.shape[0]
         widths = seen.shape[1], acts.shape[1]
         self.sizes = widths if all(isinstance(each, int) for each in widths) else None
 
     def __call__(self, observations: NDArray[Any]) -> NDArray[Any]:
-        """Actions, the first output, for a batch of observations."""
+        """Actions, the first output, for a batch of observations; OnnxModelError if it fails on them."""
         given = np.ascontiguousarray(observations, self._dtype)
         if not isinstance(self._batch, int) or self._batch == len(given):
-            return np.asarray(self._session.run(None, {self._name: given})[0])
+            return self._acted(given)
         # A file whose batch is fixed, mostly to 1.
         short = -len(given) % self._batch
         padded = np.concatenate([given, given[:1].repeat(short, axis=0)]) if short else given
         parts = padded.reshape(-1, self._batch, given.shape[1])
-        found = [self._session.run(None, {self._name: part})[0] for part in parts]
-        return np.concatenate(found)[: len(given)]
+        return np.concatenate([self._acted(part) for part in parts])[: len(given)]
+
+    def _acted(self, given: NDArray[Any]) -> NDArray[Any]:
+        try:
+            return np.asarray(self._session.run(None, {self._name: given})[0])
+        except Exception as error:  # its errors have no class in common
+            sentence = f"{self._path}: fails on observations of shape {given.shape}"
+            raise OnnxModelError(f"{sentence}: {str(error).splitlines()[0]}") from error
+
+
+def tensor_files(path: Path) -> list[Path]:
+    """Files that hold tensors of a network outside of its own, as PyTorch writes them; sorted."""
+    content = path.read_bytes()
+    names = {content[each.end() : each.end() + each[1][0]] for each in _PLACE.finditer(content)}
+    places = (path.parent / os.fsdecode(name) for name in names if b"\0" not in name)
+    return sorted(place for place in places if place.is_file())
