@@ -114,7 +114,8 @@ def validation_costs(
     progress: Callable[[int, int], None] = lambda done, problems: None,
 ) -> OptimalCosts:
     """Likewise from the first n validation starts, which learning curves are flown from."""
-    settings = _ValidationStarts.of(scene, max(n, EVALUATION_SEEDS), VALIDATION_SEED, GROUP)
+    problems = GROUP * -(-max(n, EVALUATION_SEEDS) // GROUP)  # a group is kept whole
+    settings = _ValidationStarts.of(scene, problems, VALIDATION_SEED, GROUP)
     return _look_up(settings, n, executor, progress)
 
 

@@ -232,6 +232,13 @@ def test_curves_are_relative_to_the_optima_of_their_own_starts(comparison, count
     assert row.facts["validation_optimum"] == np.nanmedian(costs.cost)
 
 
+def test_optima_of_more_validation_than_evaluation_starts_are_kept(cache, counting, quick, monkeypatch):
+    monkeypatch.setattr("agents.evaluation.expert_costs.EVALUATION_SEEDS", 3)
+    first = validation_costs(quick, 5, SerialExecutor())
+    again = validation_costs(quick, 5, counting(limit=0))
+    np.testing.assert_array_equal(again.cost, first.cost)
+
+
 def test_finished_rows_are_taken_up(tmp_path, monkeypatch, quick):
     run = write_policy(tmp_path / "stub-0", quick)
     arguments = {"controllers": ("gains",), "out": tmp_path / "out", "executor": SerialExecutor()}
