@@ -14,7 +14,7 @@ from agents.evaluation.comparison_tables import COLUMNS, percent
 from agents.suite.running import Score, SuiteRun
 from agents.suite.tasks import Suite, SuiteError
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
-from dq_space_arm_env.common.files import json_value
+from dq_space_arm_env.common.files import differences, json_value
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.report_page import Page, Section
 from dq_space_arm_env.common.shown_text import shortened
@@ -113,8 +113,9 @@ def comparable(
     """
     theirs_suite, theirs = published(file)
     mine = suite.model_dump(mode="json", include={"name", "starts", "tasks"})
-    if any(theirs_suite.get(key) != mine[key] for key in ("name", "starts", "tasks")):
-        raise SuiteError(f"{file}: is of {theirs_suite.get('name')!r}, should be of {suite.name!r}")
+    found = differences({key: theirs_suite.get(key) for key in mine}, mine)
+    if found:
+        raise SuiteError(f"{file}: is of another suite than {suite.name!r}: {'; '.join(found)}")
     flown = set(tasks)
     known = dict.fromkeys(name for task, _, name in theirs if task in flown)
     if not known:

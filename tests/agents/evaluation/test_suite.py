@@ -290,6 +290,11 @@ def test_a_check_that_compares_nothing_is_refused_before_anybody_flies(content, 
         comparable(theirs, suite, [other], ["mine"])
     assert len(comparable(theirs, suite, suite.tasks, ["mine"])) == 1
     assert "apg (zoo)" in entrant_names((), suite)
+    longer = suite.model_copy(update={"starts": N + 1})
+    with pytest.raises(
+        SuiteError, match=f"another suite than 'two tasks': starts is {N} there and {N + 1} here"
+    ):
+        comparable(theirs, longer, suite.tasks, ["mine"])
     own = (tmp_path / "suite.json").write_bytes(theirs.read_bytes())  # would be compared with itself
     verb = ["gains", "--suite", str(file), "--out", str(tmp_path), "--check", str(tmp_path / "suite.json")]
     refused = CliRunner().invoke(suite_verb, verb)
