@@ -60,7 +60,8 @@ class Evaluation:
         flights: Outcome of each episode.
         optimal: The expert's costs from the same starts; None if not asked for.
         action_seconds: Time per action, s.
-        wall_seconds: Time of all flights together, with the plans of the controllers that fly by them, s.
+        wall_seconds: Time of all flights together, with the plans of the controllers that fly by them, s;
+            flights in the cache, where those of other controllers put them too, take next to none.
         metadata: Metadata of the policy's file.
         same_scene: Whether it was trained in the scene that the condition changes; None if unknown.
     """
