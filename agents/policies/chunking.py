@@ -108,7 +108,7 @@ class ChunkingPolicy:
             ValueError: If a tensor is missing, a shape does not fit, a number is not finite or out of range,
                 or the activation is unknown.
         """
-        self.tensors = {name: np.asarray(array, np.float32) for name, array in self.tensors.items()}
+        self.tensors = {name: np.array(array, np.float32) for name, array in self.tensors.items()}
         self.mean, self.scale = np.array(self.mean, np.float64), np.array(self.scale, np.float64)
         _check(self)
         self._doubles = {name: array.astype(np.float64) for name, array in self.tensors.items()}

@@ -148,8 +148,9 @@ class ExportedPolicy:
         Raises:
             ValueError: If a shape does not fit, a number is not finite, or a function is unknown.
         """
-        self._adopt("weights", tuple(np.ascontiguousarray(array, np.float32) for array in self.weights))
-        self._adopt("biases", tuple(np.ascontiguousarray(array, np.float32) for array in self.biases))
+        # Copies: a network that is trained on would change what `save` writes, and not the actions.
+        self._adopt("weights", tuple(np.array(array, np.float32, order="C") for array in self.weights))
+        self._adopt("biases", tuple(np.array(array, np.float32, order="C") for array in self.biases))
         self._adopt("mean", np.array(self.mean, np.float64))
         self._adopt("scale", np.array(self.scale, np.float64))
         if self.action_scale is not None:

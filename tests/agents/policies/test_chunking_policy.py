@@ -43,6 +43,18 @@ def flight(policy, seen):
     return np.array([policy(each) for each in seen])
 
 
+def test_a_policy_stays_what_it_was_when_the_arrays_that_it_was_made_of_change(tmp_path):
+    given, seen = parts(), observations(5)
+    given["tensors"] = {name: array.astype(np.float32) for name, array in given["tensors"].items()}
+    policy = ChunkingPolicy(**given)
+    for array in given["tensors"].values():
+        array += 1.0
+    policy.save(tmp_path / "policy.npz")
+    np.testing.assert_array_equal(
+        flight(ChunkingPolicy.load(tmp_path / "policy.npz"), seen), flight(policy, seen)
+    )
+
+
 @pytest.mark.parametrize("weighting", [0.0, 0.2, -0.3])
 def test_an_action_is_the_weighted_mean_of_all_predictions_of_it(weighting):
     rng = np.random.default_rng(2)

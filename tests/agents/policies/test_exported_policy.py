@@ -49,6 +49,17 @@ def observations(count=50):
     return np.random.default_rng(1).normal(size=(count, N_OBS))
 
 
+def test_a_policy_stays_what_it_was_when_the_arrays_that_it_was_made_of_change(tmp_path):
+    given, seen = parts(), observations()
+    policy = ExportedPolicy(**given)
+    actions = policy(seen)
+    for array in (*given["weights"], *given["biases"], given["mean"], given["scale"]):
+        array += 1.0
+    policy.save(tmp_path / "policy.npz")
+    np.testing.assert_array_equal(policy(seen), actions)
+    np.testing.assert_array_equal(ExportedPolicy.load(tmp_path / "policy.npz")(seen), actions)
+
+
 @pytest.mark.parametrize("limit", [np.inf, 0.7])
 @pytest.mark.parametrize("squash", ["clip", "tanh"])
 @pytest.mark.parametrize("activation", ["tanh", "silu", "relu"])
