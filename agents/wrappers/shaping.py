@@ -26,9 +26,15 @@ def check_repeat(repeat: int, reward: str, discount: float) -> None:
         raise ValueError(f"repeat: {repeat!r}, should be a whole number of time steps, at least 1")
     if reward not in get_args(HeldReward):
         raise ValueError(f"reward: {reward!r}, should be 'sum' or 'last'")
-    real_array("discount", discount)
+    _check_number("discount", discount)
     if not 0.0 < discount <= 1.0:
         raise ValueError(f"discount: {discount!r}, should be above 0 and at most 1")
+
+
+def _check_number(name: str, value: Any) -> None:
+    """Raise TypeError for what is not one real number."""
+    if real_array(name, value).shape:
+        raise TypeError(f"{name}: {value!r}, should be one number")
 
 
 def held_metadata(metadata: dict[str, Any], repeat: int) -> dict[str, Any]:
@@ -97,7 +103,7 @@ class Shaping(NamedTuple):
         """Check the arguments of `ShapeReward`; ValueError or TypeError for those that are wrong."""
         ends = {"success_reward": success_reward, "end_error_cost": end_error_cost}
         for name, value in {"scale": scale, "power": power, **ends}.items():
-            real_array(name, value)
+            _check_number(name, value)
         if not (np.isfinite(scale) and scale > 0.0):
             raise ValueError(f"scale: {scale!r}, should be a positive number")
         if not 0.0 < power <= 1.0:

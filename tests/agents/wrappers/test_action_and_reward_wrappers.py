@@ -215,6 +215,8 @@ def test_vector_wrappers_pickle_with_their_episodes():
         (lambda env: ShrinkActionSpace(env, {"base_force": None}), TypeError, "scale of base_force: of type"),
         (lambda env: ShrinkActionSpace(env, {1: 0.5}), ValueError, "no actuator is named 1; choose from"),
         (lambda env: ShapeReward(env, scale="1"), TypeError, "scale: of type"),
+        (lambda env: ShapeReward(env, scale=[1.0, 2.0]), TypeError, "scale: .*, should be one number"),
+        (lambda env: RepeatAction(env, 2, discount=[1.0]), TypeError, "discount: .*, should be one number"),
         (lambda env: ShapeReward(env, end_error_cost=None), TypeError, "end_error_cost: of type"),
         (lambda env: ShrinkActionSpace(env, 1.5), ValueError, "scale: 1.5, should be numbers above 0"),
         (lambda env: ShrinkActionSpace(env, [0.5] * 3), ValueError, "one for each of the 12 actions"),
