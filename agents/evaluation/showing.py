@@ -84,8 +84,9 @@ def _table(pairs: Sequence[SideBySide]) -> TextTable:
         Column("is_success", "target", lambda success: "reached" if success else "missed"),
         Column("time"),
     )
-    tolerance = f"{scene.success.attitude_error_deg:g}°, {scene.success.position_error:g} m"
-    return tabulate(f"Scene {scene.name}; tolerance {tolerance}", rows, columns)
+    tolerances = zip(scene.success.tolerances, ("°", " m", "°/s", " m/s"), strict=True)
+    named = ", ".join(f"{largest:g}{unit}" for largest, unit in tolerances if math.isfinite(largest))
+    return tabulate(f"Scene {scene.name}; tolerance {named}", rows, columns)
 
 
 def _save(console: Console, destination: Destination, gif: Path | None, pairs: Sequence[SideBySide]) -> None:

@@ -1,6 +1,7 @@
 """A flight beside the expert's solution: the same start, the right numbers, pictures, and the verb."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from agents.evaluation import evaluate, evaluation_seeds
 from agents.evaluation.beside_expert import fly_beside_expert
 from agents.evaluation.plan_followers import onboard_follower
+from agents.evaluation.showing import _table
 from agents.policies import ExportedPolicy
 from agents.residual.informed import _solved
 from agents.zoo.finding import as_policy
@@ -83,6 +85,10 @@ def test_a_flight_is_that_of_an_evaluation(exported, quick):
     """The same seed, the same policy: cost, errors and effort agree."""
     seed = evaluation_seeds(quick, 1)[0]
     (pair,) = fly_beside_expert(as_policy(exported), quick, [seed])
+    maneuver = pair.agent.maneuver
+    moving = maneuver.scene.replace(success={"velocity_error": 0.02})
+    agent = replace(pair.agent, maneuver=replace(maneuver, scene=moving))
+    assert _table([replace(pair, agent=agent)]).title == "Scene quick; tolerance 3°, 0.1 m, 0.02 m/s"
     flights = evaluate(exported, quick, 1, expert=False).flights
     assert pair.agent.cost == pytest.approx(flights.cost[0], rel=1e-12)
     for name in ("attitude_error", "position_error", "effort"):
