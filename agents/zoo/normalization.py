@@ -19,6 +19,8 @@ from agents.policies.pickled_arrays import Inert, PickledError, as_array, read_p
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_bytes
 
 _MOST_BYTES = 1 << 24
+_PLAIN_OBSERVATIONS = (wrappers.DtypeObservation, wrappers.FlattenObservation)
+"""Wrappers that leave the numbers of an observation as they are."""
 _VEC_NORMALIZE = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
 
 
@@ -122,10 +124,15 @@ def _check_wrappers(model: Any) -> None:
         environment = environment.venv
     env = getattr(environment, "vector_env", next(iter(getattr(environment, "envs", ())), None))
     while isinstance(env, gymnasium.Wrapper | VectorWrapper):
-        if isinstance(env, wrappers.NormalizeObservation | wrappers.vector.NormalizeObservation):
+        if isinstance(env, wrappers.NormalizeObservation):
             raise StatisticsError(
                 "the model's observations pass Gymnasium's NormalizeObservation, whose statistics are not "
                 "read: train in VecNormalize of Stable-Baselines3"
+            )
+        if isinstance(env, gymnasium.ObservationWrapper) and not isinstance(env, _PLAIN_OBSERVATIONS):
+            raise StatisticsError(
+                f"the model's observations pass {type(env).__name__}, which only its environment applies: "
+                "give a function of plain observations that applies it before model.predict"
             )
         if isinstance(env, gymnasium.ActionWrapper) and _changes_actions(env):
             raise StatisticsError(

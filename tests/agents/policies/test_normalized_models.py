@@ -57,15 +57,20 @@ def test_wrappers_of_single_environments_that_a_model_does_not_note_are_refused(
 
     small = model_in(lambda env: SingleShrinkActionSpace(env, 0.1), rescaled)
     seen = model_in(wrappers.NormalizeObservation)
+    tenfold = model_in(
+        lambda env: wrappers.TransformObservation(env, lambda x: 10 * x, env.observation_space)
+    )
     for model, said in (
         (small, "actions pass RescaleAction of a single"),
         (seen, "pass Gymnasium's Normalize"),
+        (tenfold, "observations pass TransformObservation, which only its environment applies"),
     ):
         with pytest.raises(ValueError, match=said):
             export_policy(model)
         with pytest.raises(PolicyError, match=said):
             as_policy(model)
     assert export_policy(model_in(rescaled)).action_scale.tolist() == [1.0] * 6  # which changes nothing
+    as_policy(model_in(wrappers.FlattenObservation))
 
 
 def observations(scene):
