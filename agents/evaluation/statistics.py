@@ -76,9 +76,12 @@ def bootstrap_interval(
 
 
 def interquartile_mean(values: ArrayLike) -> float:
-    """Mean without the lowest and highest quarter: robust as the median, and statistically more efficient."""
+    """Mean without the lowest and highest quarter: robust as the median, and statistically more efficient.
+
+    NaN without values, and where one is NaN.
+    """
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=None)
-    if ordered.size == 0:
+    if ordered.size == 0 or np.isnan(ordered[-1]):  # the last one if any, which would count as the largest
         return math.nan
     cut = ordered.size // 4
     return float(np.mean(ordered[cut : ordered.size - cut]))

@@ -42,6 +42,7 @@ def test_the_interquartile_mean_leaves_out_a_quarter_on_either_side():
     assert interquartile_mean([[1.0, 2.0], [4.0, 1000.0]]) == 3.0
     assert interquartile_mean([1.0, 2.0, 6.0]) == 3.0  # a quarter of three is none
     assert math.isnan(interquartile_mean([]))
+    assert math.isnan(interquartile_mean([1.0, math.nan, 2.0, 3.0]))
     values = np.random.default_rng(0).standard_normal(103)
     assert interquartile_mean(values) == pytest.approx(trim_mean(values, 0.25), abs=1e-14)
 
