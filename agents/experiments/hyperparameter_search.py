@@ -131,9 +131,13 @@ class _Search:
 
     def run(self, executor: Executor, report: Report) -> None:
         """Run the trials that are missing, those first that were interrupted."""
+        from optuna.trial import TrialState
+
         found = sum(trial.state.is_finished() for trial in self._study.get_trials(deepcopy=False))
         overview = Overview(max(self._trials, found), "trials", found)
         demonstrations = SharedDemonstrations(executor, overview.say)
+        for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            demonstrations.remember(self._task(trial.number, trial.params))
 
         def show(advance: Any) -> None:
             self._watch()
@@ -187,17 +191,21 @@ class _Search:
                 params[key] = trial.suggest_int(key, parameter.low, parameter.high, log=parameter.log)
             else:
                 params[key] = trial.suggest_float(key, parameter.low, parameter.high, log=parameter.log)
-        name = self._named(trial.number).name
         try:
-            configuration = with_values(self._configuration, self.values(params), name)
+            task = self._task(trial.number, params)
         except ConfigurationError as error:
             trial.set_user_attr("failure", str(error))
             self._study.tell(trial.number, state=TrialState.FAIL)
             return
-        task = training_task(configuration, self._out / TRIALS)
         with self._lock:
             self._under_way[str(task.folder)] = trial, task
         yield task
+
+    def _task(self, number: int, params: Mapping[str, Any]) -> TrainingTask:
+        """The training of a trial; ConfigurationError where its values do not go together."""
+        name = self._named(number).name
+        configuration = with_values(self._configuration, self.values(params), name)
+        return training_task(configuration, self._out / TRIALS)
 
     def _named(self, number: int) -> AgentConfiguration:
         name = f"{self._configuration.name}-trial-{number}"

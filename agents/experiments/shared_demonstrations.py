@@ -14,7 +14,7 @@ from agents.demonstrations import prepare_demonstrations
 from agents.experiments.training_task import TrainingTask
 from agents.run_folder import DEMONSTRATIONS
 from agents.training import is_trained
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.files import temporary_name
 from dq_space_arm_env.common.progress import Advance
 from experts.demonstrations import DemonstrationsError
@@ -37,10 +37,9 @@ class SharedDemonstrations:
         if source is None:
             return task
         scene = load_scene(task.configuration.scene)
-        key = json.dumps([scene.content_hash(), source.model_dump(mode="json")])
+        key = _key(scene, source)
         if is_trained(task.configuration, task.folder):
-            if (place / _MANIFEST).is_file():
-                self._made.setdefault(key, place)
+            self.remember(task)
         elif key not in self._made:
             try:
                 prepare_demonstrations(source, scene, place, executor=self._executor, progress=self._report)
@@ -50,6 +49,18 @@ class SharedDemonstrations:
         elif not place.exists():
             _link(self._made[key], place)
         return task
+
+    def remember(self, task: TrainingTask) -> None:
+        """Know the demonstrations of a training, if it is finished, for others that need the same."""
+        source, place = _generated(task.configuration.resolved()), task.folder / DEMONSTRATIONS
+        if source is None or not (place / _MANIFEST).is_file():
+            return
+        if is_trained(task.configuration, task.folder):
+            self._made.setdefault(_key(load_scene(task.configuration.scene), source), place)
+
+
+def _key(scene: Scene, source: DemonstrationSource) -> str:
+    return json.dumps([scene.content_hash(), source.model_dump(mode="json")])
 
 
 def _generated(configuration: AgentConfiguration) -> DemonstrationSource | None:

@@ -93,6 +93,24 @@ def test_a_search_resumes_and_its_best_can_be_trained(
         search(wider, space, 4, out, executor=SerialExecutor())
 
 
+@pytest.mark.slow
+def test_more_trials_learn_from_the_demonstrations_of_finished_ones(
+    small_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("optuna")
+    pytest.importorskip("torch")
+    content = {"name": "clone", "scene": str(small_file), "demonstrations": {"problems": 4}}
+    algorithm = {"name": "cloning", "optimization": {"updates": 3, "batch_size": 4}, "validate_every": 3}
+    configuration = load_configuration({**content, "algorithm": algorithm})
+    rates = {"algorithm.optimization.learning_rate": {"low": 1e-3, "high": 1e-2}}
+    space = SearchSpace.model_validate({"search": rates})
+    search(configuration, space, 1, tmp_path, executor=SerialExecutor())
+    shared = "agents.experiments.shared_demonstrations.prepare_demonstrations"
+    monkeypatch.setattr(shared, lambda *_, **__: pytest.fail("generated again"))
+    found = search(configuration, space, 2, tmp_path, executor=SerialExecutor())
+    assert [row["outcome"] for row in found.trials] == ["trained", "trained"]
+
+
 def test_a_trial_that_is_given_up_stops(
     configuration: AgentConfiguration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
