@@ -90,7 +90,7 @@ def as_policy(
         return ActingPolicy(name, policy, policy, False, policy.metadata, sizes)
     if callable(getattr(policy, "predict", None)):
         predict = _predictor(policy, _statistics(policy, normalize))
-        return ActingPolicy(label or type(policy).__name__, predict, predict, True, {})
+        return ActingPolicy(label or type(policy).__name__, predict, predict, True, {}, _sizes(policy))
     if normalize is not None:
         raise PolicyError("normalize: is for models of Stable-Baselines3")
     if isinstance(policy, OnnxModel):
@@ -118,7 +118,16 @@ def _as_normalized(path: Path, label: str, trust: bool, file: Path) -> ActingPol
     except StatisticsError as error:
         raise PolicyError(f"normalize: {error}") from error
     predict = _predictor(loaded, statistics)
-    return ActingPolicy(label, predict, predict, True, {})
+    return ActingPolicy(label, predict, predict, True, {}, _sizes(loaded))
+
+
+def _sizes(model: Any) -> tuple[int, int] | None:
+    """Entries of a model's observations and actions; None where they have names, or it does not tell."""
+    spaces = (getattr(model, name, None) for name in ("observation_space", "action_space"))
+    shapes: list[Any] = [getattr(space, "shape", None) for space in spaces]
+    if any(shape is None or len(shape) != 1 for shape in shapes):
+        return None
+    return shapes[0][0], shapes[1][0]
 
 
 def _statistics(model: Any, file: str | Path | None) -> ObservationStatistics | None:

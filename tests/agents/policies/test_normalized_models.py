@@ -80,6 +80,13 @@ def observations(scene):
     return np.concatenate([env.step(env.action_space.sample())[0] for _ in range(4)])
 
 
+def test_a_model_in_memory_of_another_scene_is_refused_before_the_expert_begins(normalized):
+    with pytest.raises(
+        PolicyError, match="PPO maps 14 observations to 6 inputs; scene 'paper' has 24 and 12"
+    ):
+        evaluate(normalized[0], "paper", 1)
+
+
 def test_every_way_to_fly_a_normalized_model_normalizes(normalized, small_scene):
     model, file, statistics = normalized
     seen = observations(small_scene)
