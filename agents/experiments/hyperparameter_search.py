@@ -126,6 +126,8 @@ class _Search:
     ) -> None:
         self._study, self._configuration, self._space = study, configuration, space
         self._out, self._trials = out, trials
+        found = sum(trial.state.is_finished() for trial in study.get_trials(deepcopy=False))
+        self._overview = Overview(max(trials, found), "trials", found)
         self._under_way: dict[str, tuple[optuna.Trial, TrainingTask]] = {}  # by folder
         self._lock = threading.Lock()  # a trial is told the study once, and nothing after that
 
@@ -133,8 +135,7 @@ class _Search:
         """Run the trials that are missing, those first that were interrupted."""
         from optuna.trial import TrialState
 
-        found = sum(trial.state.is_finished() for trial in self._study.get_trials(deepcopy=False))
-        overview = Overview(max(self._trials, found), "trials", found)
+        overview = self._overview
         demonstrations = SharedDemonstrations(executor, overview.say)
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             demonstrations.remember(self._task(trial.number, trial.params))
@@ -196,6 +197,7 @@ class _Search:
         except ConfigurationError as error:
             trial.set_user_attr("failure", str(error))
             self._study.tell(trial.number, state=TrialState.FAIL)
+            self._overview.end({"folder": "", "outcome": FAILED})  # it has none
             return
         with self._lock:
             self._under_way[str(task.folder)] = trial, task

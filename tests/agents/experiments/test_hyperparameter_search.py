@@ -15,6 +15,7 @@ from agents.experiments.hyperparameter_search import JOURNAL, score, search
 from agents.experiments.search_space import SearchSpace, load_search_space, with_values
 from agents.experiments.training_task import PRUNE
 from agents.run_folder import RunFolderError, learned
+from dq_space_arm_env.common.progress import Status
 from experts.demonstrations import SerialExecutor
 
 pytestmark = pytest.mark.agents
@@ -149,7 +150,10 @@ def test_values_that_do_not_go_together_are_a_failed_trial(
         raise ValueError("not trained here")
 
     monkeypatch.setattr("agents.experiments.training_task.train", fail)
-    none = search(configuration, impossible, 8, tmp_path / "impossible", executor=SerialExecutor())
+    told: list[Status] = []
+    out = tmp_path / "impossible"
+    none = search(configuration, impossible, 8, out, executor=SerialExecutor(), report=told.append)
+    assert told[-1].line == "8 of 8 trials, 100%, 8 failed"
     assert (none.best, none.file) == (None, None)
     for row in none.trials:
         together = row["algorithm.copies"] * row["algorithm.decisions"] > 100_000_000
