@@ -30,7 +30,7 @@ from typing import Any
 
 from rich.console import Console
 
-from agents.evaluation.conditions import CONDITIONS, physics_hash
+from agents.evaluation.conditions import CONDITIONS, physics_hash, scene_under
 from agents.evaluation.evaluating import Advance, Evaluation, evaluate
 from agents.evaluation.evaluation_verbs import progress_bar
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
@@ -81,6 +81,8 @@ def add_to_zoo(
     for other in others:  # before hours of flights
         check_fit(as_policy(policy), other)
     ordered = ["training", *(condition for condition in conditions if condition != "training")]
+    for condition in ordered:
+        scene_under(scene, condition)  # likewise
     evaluations = [
         evaluate(
             policy,

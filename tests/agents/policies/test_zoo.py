@@ -128,6 +128,8 @@ def test_what_does_not_belong_into_the_zoo_is_refused(shipped, tmp_path, monkeyp
         add_to_zoo(other, training="x", shelf=shelf)
     # Scenes to fly it in besides are looked at before the first flight.
     monkeypatch.setattr("scripts.add_to_zoo.evaluate", lambda *given, **options: pytest.fail("flies"))
+    with pytest.raises(ValueError, match="condition: 'rain' is unknown"):
+        add_to_zoo(run, training="x", conditions=["spin", "rain"], shelf=shelf)
     found = {"quick": QUICK}
     monkeypatch.setattr("scripts.add_to_zoo.load_scene", lambda name: found.get(name) or load_scene(name))
     with pytest.raises(SceneError, match="no-such-scene"):
