@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env.kernels.adaptive import CATCH_NOW
 from dq_space_arm_env.kernels.programs.paper_programs import PaperPrograms
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.report.integrator_precision import observed_order
@@ -19,6 +20,7 @@ from scripts.benchmarks.work_precision.many_digits import evaluate, torque_free_
 from scripts.benchmarks.work_precision.measurement import (
     Curve,
     Result,
+    _estimates,
     default_at_step,
     errors_of,
     is_rounding,
@@ -34,7 +36,7 @@ from scripts.benchmarks.work_precision.motions import (
     make_case,
     scene_case,
 )
-from scripts.benchmarks.work_precision.references import reference_of
+from scripts.benchmarks.work_precision.references import Reference, reference_of
 
 pytestmark = pytest.mark.slow  # they compile many variants of scenes
 
@@ -200,6 +202,46 @@ def test_a_walk_takes_the_steps_of_the_kernels(monkeypatch: pytest.MonkeyPatch) 
     passed, inputs = walk.passed(2, 5)
     assert np.array_equal(passed, np.array(states)[[0, 9, 19, 29, 39]])
     assert np.array_equal(inputs, case.controls[[0, 4, 9, 14, 19]])
+
+
+def staged(name: str) -> MotionCase:
+    """Nothing is done in a scene, from its start, whatever its phases change."""
+    scene = load_scene(name)
+    kernels, still = compile_scene(scene), np.zeros((scene.simulation.steps, compile_scene(scene).n_u))
+    start = kernels.layout.initial_state.astype(np.float64)
+    rows = kernels.stage_parameters()[:-1]
+    return MotionCase(name, name, scene, start, still, scene.simulation.dt, 1, 0.0, parameters=rows)
+
+
+def test_a_walk_goes_through_the_phases_of_a_scene_and_catches_once() -> None:
+    """The parameters are those of the hold; where its steps are divided, a catch follows the last of them."""
+    case = staged("capture-and-detumble")
+    kernels, rows = compile_scene(case.scene), case.parameters
+    assert rows is not None
+    now = kernels.parameters.names.index(CATCH_NOW)
+    assert rows[:, now].sum() == 1.0
+    walk, before = Walk(Method("rk4", 4), kernels, case), rows.copy()
+    before[:, now] = 0.0
+    for per_hold in (1, 2):
+        walk.run(per_hold)
+        x = case.start
+        for row, u in enumerate(case.controls):
+            for p in [before[row]] * (per_hold - 1) + [rows[row]]:
+                x = kernels.step(x, u, case.hold / per_hold, "rk4", p=p)
+        assert np.array_equal(walk.state, x)
+        assert np.abs(x - case.start).max() > 1e-3  # caught
+
+
+@pytest.mark.parametrize("name", ["motors", "capture-and-detumble"])
+def test_global_errors_are_not_estimated_where_adaptive_steps_do_not_follow(name: str) -> None:
+    case = staged(name)
+    assert list(_estimates(case, Reference(case.start, "nobody"), SHORT)) == []
+
+
+def test_the_maneuver_of_a_scene_has_the_parameters_of_its_stages() -> None:
+    case = scene_case("planar")
+    assert case.parameters is not None
+    assert len(case.parameters) == len(case.controls)
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ import numpy as np
 
 from dq_space_arm_env import Kernels
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.kernels.adaptive import CATCH_NOW
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
@@ -202,8 +203,13 @@ def _point(
 
 
 def _estimates(case: MotionCase, reference: Reference, effort: Effort) -> Iterator[Row]:
-    """True and estimated global errors of `Kernels.integrate`, with smaller and smaller tolerances."""
+    """True and estimated global errors of `Kernels.integrate`, with smaller and smaller tolerances.
+
+    None where the scene has a lag, a delay or a catch, which adaptive steps do not follow.
+    """
     kernels = Method("rk4", 4).kernels(case.scene)
+    if kernels.layout.chains or CATCH_NOW in kernels.parameters.names:
+        return
     of_places = slice(kernels.layout.tangent.base_velocity.start)  # pose and angles
     for tolerance in effort.tolerances:
         keys = INTEGRATORS["dormand_prince"].within(tolerance)
@@ -214,6 +220,7 @@ def _estimates(case: MotionCase, reference: Reference, effort: Effort) -> Iterat
             rtol=keys["rtol"],
             atol=keys["atol"],
             max_steps=effort.most_steps,
+            p=case.parameters,
         )
         errors = kernels.difference(reference.state, motion.x[-1]), motion.global_error()[-1]
         true, estimated = (float(np.abs(each[of_places]).max()) for each in errors)

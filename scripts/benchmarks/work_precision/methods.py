@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dq_space_arm_env import Kernels, Scene, compile_scene
+from dq_space_arm_env.kernels.adaptive import CATCH_NOW
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
@@ -88,8 +89,14 @@ class Walk:
         self._start = method.own_state(kernels, case.start[None])[0]
         self._states = np.zeros((_ROWS + 1, len(self._start)))
         self._inputs, self._step = np.zeros((_ROWS, kernels.n_u)), np.zeros(1)
-        nominal = np.tile(kernels.parameters.nominal, (_ROWS, 1))
-        arrays = {"x": self._states, "parameters": nominal, "u": self._inputs, "h": self._step}
+        nominal, names = kernels.parameters.nominal, kernels.parameters.names
+        self._parameters = np.zeros((_ROWS, len(nominal)))
+        # Of each hold; a catch comes at its end, not after each of its steps.
+        self._given = np.broadcast_to(nominal, (len(case.controls), len(nominal)))
+        if case.parameters is not None:
+            self._given = case.parameters
+        self._catch = names.index(CATCH_NOW) if CATCH_NOW in names else None
+        arrays = {"x": self._states, "parameters": self._parameters, "u": self._inputs, "h": self._step}
         self._call = KernelCall(kernel, {**arrays, kernel.outputs[0].name: self._states[1:]})
 
     def run(self, per_hold: int) -> None:
@@ -121,7 +128,10 @@ class Walk:
         total = per_hold * len(self._case.controls)
         for first in range(0, total, _ROWS):
             rows = min(_ROWS, total - first)
-            self._inputs[:rows] = self._case.controls[(first + np.arange(rows)) // per_hold]
+            holds, steps = np.divmod(first + np.arange(rows), per_hold)
+            self._inputs[:rows], self._parameters[:rows] = self._case.controls[holds], self._given[holds]
+            if self._catch is not None:
+                self._parameters[:rows][steps < per_hold - 1, self._catch] = 0.0
             self._call(rows)
             yield first, rows
             self._states[0] = self._states[rows]

@@ -42,6 +42,7 @@ class MotionCase:
     is_smooth: bool = True
     with_paper_form: bool = False
     has_other_code: bool = True
+    parameters: FloatArray | None = None  # of each hold, shape (holds, n_p); nominal ones if None
 
     @property
     def duration(self) -> float:
@@ -130,6 +131,7 @@ def scene_case(name: str) -> MotionCase:
         1,
         limit=DEFAULT_ACCURACY,
         has_other_code=False,
+        parameters=np.array(solution.parameters[:-1], dtype=np.float64),
     )
 
 
