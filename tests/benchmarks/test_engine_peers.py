@@ -86,6 +86,22 @@ def test_missing_engines_and_unsuitable_scenes_leave_a_note(
     assert ["pip install pin)" in notes[0], "pip install mujoco)" in notes[1]] == [True, True]
 
 
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [
+        ("capture-and-detumble", "a payload that is caught"),
+        ("heavy-wrist", "joints that slide or turn about several axes"),
+        ("motors", "motors"),
+        ("sliding", "joints that slide or turn about several axes"),
+        ("thrusters", "thrusters"),
+        ("wheels", "wheels"),
+    ],
+)
+def test_engines_that_would_move_another_robot_are_left_out(name: str, more: str) -> None:
+    sentence = f"Scene {name} has no peers: they are not given {more}."
+    assert peers_of(compile_scene(name)) == ([], [sentence])
+
+
 def test_without_basilisk_its_benchmark_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "Basilisk", None)
     (row,) = BENCHMARK.measure(QUICK)

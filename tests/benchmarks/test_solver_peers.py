@@ -275,6 +275,11 @@ def test_crocoddyl_refuses_weights_that_its_residual_has_not(crocoddyl: Any) -> 
         ("tip-load", "a wrench"),
         ("tracking", "a target that moves"),
         ("refuelling", "phases"),
+        ("elastic-joints", "steps of rodas4 or motors"),
+        ("sliding", "joints that slide"),
+        ("six-joint", "steps of rk6"),
+        ("thrusters", "thrusters"),
+        ("wheels", "wheels"),
     ],
 )
 def test_crocoddyl_is_left_out_with_a_sentence(name: str, reason: str) -> None:
@@ -290,8 +295,16 @@ def test_the_papers_formulation_refuses_more_than_a_target_at_rest(name: str) ->
         PaperProblem(load_scene(name))
 
 
-@pytest.mark.parametrize(("name", "more"), [("release", "phases"), ("dual-arm", "tips of other arms")])
-def test_interior_point_methods_refuse_phases_and_other_tips(name: str, more: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [
+        ("release", "phases"),
+        ("dual-arm", "tips of other arms"),
+        ("motors", "actuators that delay or lag"),
+        ("six-joint", "steps of rk6"),
+    ],
+)
+def test_interior_point_methods_refuse_what_they_are_not_given(name: str, more: str) -> None:
     with pytest.raises(ValueError, match=f"interior-point methods are left out: they are not given {more}"):
         transcribe(ArmProblem(name))
 

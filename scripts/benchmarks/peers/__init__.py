@@ -34,10 +34,13 @@ def peers_of(kernels: Kernels) -> tuple[list[Peer], list[str]]:
     """Build a scene's robot in the engines that are installed; and a sentence for each that is left out."""
     from scripts.benchmarks.peers.mujoco_peer import MujocoPeer
     from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
+    from scripts.benchmarks.peers.robot import beyond_the_robot
 
     tree = KinematicTree.from_scene(kernels.scene)
     if tree.tip_wrench is not None:
         return [], [f"Scene {kernels.scene.name} has no peers: their wrenches do not turn with a wrist."]
+    if more := beyond_the_robot(kernels.scene):
+        return [], [f"Scene {kernels.scene.name} has no peers: they are not given {' or '.join(more)}."]
     peers: list[Peer] = []
     notes = []
     for title, package, kind in (("Pinocchio", "pin", PinocchioPeer), ("MuJoCo", "mujoco", MujocoPeer)):

@@ -35,7 +35,8 @@ from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import beyond_the_paper
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
-from scripts.benchmarks.peers.robot import Robot
+from scripts.benchmarks.peers.robot import Robot, beyond_the_robot
+from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
 RATE_PENALTY = 3e3
 """Weight of the squared excess of a wrist rate over its limit, (s/rad)^2.
@@ -55,8 +56,10 @@ def obstacle(problem: ArmProblem) -> str | None:
         "parts without an actuator": not tree.planar and layout.n_u < inputs,
         "springs or dampers": any(link.stiffness or link.damping for link in tree.links),
         "a wrench at the tip": tree.tip_wrench is not None,
+        f"steps of {problem.integrator}": problem.integrator not in COMPARED_INTEGRATORS,
     }
-    found = [reason for reason, applies in reasons.items() if applies] + beyond_the_paper(problem.scene)
+    found = [reason for reason, applies in reasons.items() if applies]
+    found += beyond_the_robot(problem.scene) + beyond_the_paper(problem.scene)
     return f"Crocoddyl is left out: it is not given {' or '.join(found)}." if found else None
 
 

@@ -6,10 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dq_space_arm_env import Kernels
+from dq_space_arm_env import Kernels, Scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import FloatArray
+
+
+def beyond_the_robot(scene: Scene) -> list[str]:
+    """What a scene has besides rigid bodies on joints that turn and generalized forces, in words."""
+    actuators = scene.actuators
+    has = {
+        "joints that slide or turn about several axes": any(x.joint_type != "revolute" for x in scene.links),
+        "motors": any(link.motor is not None for link in scene.links),
+        "wheels": actuators.wheels is not None,
+        "thrusters": actuators.thrusters is not None,
+        "a payload that is caught": any(phase.catch is not None for phase in scene.phases),
+    }
+    return [words for words, applies in has.items() if applies]
 
 
 @dataclass(frozen=True)

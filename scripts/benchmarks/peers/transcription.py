@@ -20,11 +20,13 @@ import numpy as np
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
 from dq_space_arm_env.task.constraint_residuals import path_residuals, terminal_residuals
 from dq_space_arm_env.task.equations import SceneEquations
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
+from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
 _OFFSETS = (0.0, 0.5, 0.5, 1.0)
 _WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -82,6 +84,10 @@ def not_given(scene: Scene) -> str | None:
     """What a scene has that no program is written for; None for nothing."""
     if scene.phases:
         return "phases"
+    if StateLayout.of(scene).chains:
+        return "actuators that delay or lag"
+    if scene.simulation.integrator not in COMPARED_INTEGRATORS:
+        return f"steps of {scene.simulation.integrator}"
     return "tips of other arms" if scene.other_tips else None
 
 

@@ -20,6 +20,7 @@ from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim, note
 from scripts.benchmarks.peers import crocoddyl_kernels, crocoddyl_penalties, interior_point_peer
+from scripts.benchmarks.peers.transcription import not_given
 from scripts.benchmarks.solvers.random_starts import draw_starts
 from scripts.benchmarks.solvers.runs import (
     GUIDED,
@@ -67,7 +68,9 @@ def measure_constrained(effort: Effort) -> Iterator[Row]:
             GUIDED: guided_ddp(problem, GuidedDDP(problem, max_iterations=effort.max_iterations)),
             "BoxDDP": box_ddp(problem, SecondOrder.HYBRID, effort.max_iterations),
         }
-        for each in filter(interior_point_peer.is_available, INTERIOR_POINT):
+        if more := not_given(scene):
+            yield note(f"IPOPT and fatrop are left out of scene {name}: they are not given {more}.")
+        for each in () if more else filter(interior_point_peer.is_available, INTERIOR_POINT):
             solvers[each] = interior_point_peer.InteriorPoint(
                 problem, each, max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE
             ).solve
