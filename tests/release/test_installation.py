@@ -106,6 +106,26 @@ def test_first_use(installed: Path, tmp_path: Path) -> None:
     assert page.startswith("<!DOCTYPE html>")
 
 
+@pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason="the oldest versions have no wheels for it")
+def test_first_use_with_the_oldest_requirements(
+    distributions: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    uv, folder = shutil.which("uv", path=Path(sys.executable).parent), tmp_path_factory.mktemp("oldest")
+    if uv is None:
+        pytest.skip("uv, which `make` installs, resolves to the oldest versions")
+    run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder)
+    install = (uv, "pip", "install", "--python", folder / "bin" / "python", "--only-binary", ":all:")
+    wheel = distributions / f"dq_space_arm-{VERSION}-py3-none-any.whl"
+    requirements = distributions / "source" / "pyproject.toml"
+    run(*install, "--resolution", "lowest-direct", "--requirement", requirements, cwd=folder)
+    run(*install, "--no-deps", wheel, cwd=folder)
+    environment = {**os.environ, "DQ_SPACE_ARM_CACHE": str(tmp_path / "cache")}
+    environment.pop("PYTHONPATH", None)
+    python = folder / "bin" / "python"
+    found = json.loads(run(python, "-I", HERE / "first_use.py", cwd=tmp_path, environment=environment))
+    assert found["version"] == VERSION
+
+
 def test_a_users_program_passes_strict_type_checks(installed: Path, tmp_path: Path) -> None:
     command = ("-m", "mypy", "--strict", "--python-executable", installed, "--cache-dir", tmp_path / "mypy")
     program = shutil.copy(HERE / "public_names.py", tmp_path)
