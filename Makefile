@@ -32,10 +32,12 @@ lint: $(VENV)/installed-$(TEST)
 	$(BIN)/mypy
 	$(BIN)/mypy scripts
 
+IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11) and "needs Python 3.11: make PYTHON=python3.11 ...")
+
 # One marker file per set of extras: a second run installs nothing. By uv: with hashes, pip refuses editable packages.
 LOCKED := --constraint requirements.lock --build-constraint requirements.lock
 $(VENV)/installed-%: pyproject.toml requirements.lock
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	test -x $(BIN)/pip || { $(PYTHON) -c '$(IS_NEW_ENOUGH)' && $(PYTHON) -m venv $(VENV); }
 	sed -n '/^uv==/,/[^\\]$$/p' requirements.lock > $(VENV)/uv.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement $(VENV)/uv.lock
 	$(BIN)/uv pip install --quiet --python $(BIN)/python $(LOCKED) --editable ".[$*]"

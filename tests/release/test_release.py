@@ -3,6 +3,7 @@
 import ast
 import importlib
 import re
+import shutil
 import subprocess
 import tomllib
 from pathlib import Path
@@ -53,6 +54,33 @@ def test_the_oldest_python_is_the_first_classifier() -> None:
     named = re.findall(pattern, "\n".join(PROJECT["project"]["classifiers"]))
     assert named[0] == PROJECT["project"]["requires-python"].removeprefix(">=")
     assert all((ROOT / package / "py.typed").is_file() for package in PACKAGES)
+
+
+def test_make_begins_again_after_half_an_environment(tmp_path: Path) -> None:
+    """As `python3 -m venv` leaves it on a machine without ensurepip; in a folder with a space."""
+    make, folder = shutil.which("make"), tmp_path / "a folder"
+    if make is None:
+        pytest.skip("no make")
+    folder.mkdir()
+    for name in ("Makefile", "pyproject.toml", "requirements.lock"):
+        shutil.copy(ROOT / name, folder)
+    half = (
+        "#!/bin/sh\n[ $1 = -c ] && exit 0\necho $* >> made\nmkdir -p .venv/bin\n"
+        "printf '#!/bin/sh\\nexit 1\\n' > .venv/bin/python\nchmod +x .venv/bin/python\nexit 1\n"
+    )
+    python = folder / "python"
+    python.write_text(half, encoding="utf-8")
+    python.chmod(0o755)
+    for _ in range(2):
+        done = subprocess.run([make, "paper", "PYTHON=./python"], cwd=folder, capture_output=True, text=True)
+        assert done.returncode != 0
+    assert (folder / "made").read_text(encoding="utf-8") == "-m venv .venv\n-m venv .venv\n"
+
+
+def test_make_refuses_older_pythons_than_the_package_does() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (oldest,) = re.findall(r"sys\.version_info < \((\d+), (\d+)\)", makefile)
+    assert PROJECT["project"]["requires-python"] == f">={'.'.join(oldest)}"
 
 
 def test_the_top_level_holds_what_is_distributed_and_nothing_else() -> None:
