@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env.common.host_machine import processors
 from dq_space_arm_env.common.tables import Column
 from experts.report.part_costs import moving_states
 from scripts.benchmarks.effort import Effort
@@ -71,7 +72,10 @@ def _measure_step(
             error = float(np.abs(found - expected).max() / np.abs(expected).max())
             kind = device.device_kind
             yield claim(what, integrator, f"scene {scene.name}, {batch:,} on {kind}", error, _BOUND)
-            subject = Subject(what=what, engine="XLA", way=kind, integrator=integrator, batch=batch)
+            cores = processors() if device.platform == "cpu" else 1  # XLA takes what it likes of them
+            subject = Subject(
+                what=what, engine="XLA", way=kind, integrator=integrator, batch=batch, threads=cores
+            )
             (timing,) = time_cases([Case(subject, run)], effort.kernel_timing)
             yield {**labels, **timing, "compile_s": compilation, "error": error}
 
@@ -106,6 +110,7 @@ BENCHMARK = Benchmark(
                 "engine",
                 Column("way", "on"),
                 "batch",
+                "threads",
                 time_column("best_ns", "best"),
                 time_column("median_ns", "median"),
                 Column("states_per_second", "per s", rate),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env.common.host_machine import processors
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from experts.report.part_costs import moving_states
 from scripts.benchmarks import devices
@@ -123,6 +124,7 @@ def test_a_device_is_compared_with_the_kernels(monkeypatch: pytest.MonkeyPatch) 
     rows = list(devices.BENCHMARK.measure(effort))
     assert len(select(rows, table="devices", engine="XLA")) == len(select(rows, status="handled")) == 4
     assert all(row["way"] == "cpu" and row["error"] < 1e-12 for row in select(rows, engine="XLA"))
+    assert {row["threads"] for row in select(rows, engine="XLA")} == {processors()}  # ours is on one core
 
 
 def test_mujoco_leaves_out_springs_and_dampers_only_where_there_are_none() -> None:
