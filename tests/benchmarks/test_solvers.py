@@ -1,6 +1,7 @@
 """The benchmark of the expert: what is concluded from runs, and that all is measured; never how fast."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import QUICK
 from scripts.benchmarks.harness import Row, select, shortcomings
-from scripts.benchmarks.solvers import _compare
+from scripts.benchmarks.solvers import _compare, receding
 from scripts.benchmarks.solvers import accuracy as contenders_module
 from scripts.benchmarks.solvers.accuracy import OURS, Contender, best_costs, compare_solvers, contenders
 from scripts.benchmarks.solvers.iterations import measure_iterations
@@ -269,6 +270,20 @@ def test_an_undisturbed_episode_costs_what_the_plan_says(problem: ArmProblem) ->
 
 
 @pytest.mark.slow
+def test_times_of_actions_are_those_that_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight that ends early has no further ones."""
+    one = np.ones(1)
+    ended = {"action_seconds": np.array([3e-3, 1e-3, 0.0, 0.0, 0.0]), "length": np.array([2])}
+    errors = {"is_success": one, "attitude_error": one, "position_error": one}
+    flight = SimpleNamespace(diverged=one > 0.0, cost=one, **ended, **errors)
+    monkeypatch.setattr(receding, "fly", lambda *given: flight)
+    plan = SimpleNamespace(solution=SimpleNamespace(cost=1.0))
+    expert: Any = SimpleNamespace(reset=lambda state: None, plan=plan, horizon=2, fallbacks=0, replans=0)
+    made_up: Any = SimpleNamespace(scene=SimpleNamespace(name="made up"), initial_state=one, time_step=2e-3)
+    row = receding._flight(made_up, expert, World("none"), [0])
+    assert (row["median_ms"], row["late"]) == (2.0, 0.5)
+
+
 def test_flights_have_every_horizon_and_disturbance(problem: ArmProblem) -> None:
     rows = list(measure_flights(problem, replace(SHORT, horizons=(10, 500, 900), episodes=2)))
     flights = select(rows, table="flights")

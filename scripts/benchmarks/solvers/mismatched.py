@@ -95,7 +95,7 @@ def _flights(subject: _Subject, start: FloatArray, mismatch: Mismatch) -> dict[s
         found[f"success {identifies}"] = bool(flight.is_success[0])
         found[f"above {identifies}"] = float(flight.cost[0]) / solved.cost - 1.0
         found[f"violated {identifies}"] = np.nan if violations is None else float(violations[0])
-        found[f"ms {identifies}"] = 1e3 * float(np.median(flight.action_seconds))
+        found[f"ms {identifies}"] = 1e3 * float(np.median(flight.action_seconds[: flight.length[0]]))
     return {**found, "replans": subject.experts[True].replans}
 
 

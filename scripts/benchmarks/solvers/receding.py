@@ -126,7 +126,7 @@ def _flight(problem: ArmProblem, expert: RecedingHorizonExpert, world: World, se
         flights.append(fly(problem, lambda state, stage: expert(state), world, seed))
         fallbacks += expert.fallbacks
         replans += expert.replans
-    times = 1e3 * np.concatenate([flight.action_seconds for flight in flights])
+    times = 1e3 * np.concatenate([flight.action_seconds[: flight.length[0]] for flight in flights])
     period = 1e3 * problem.time_step
     return {
         "table": "flights",
