@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import stat
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -33,9 +34,18 @@ _USED_AGAIN = 3600.0  # s; the time of the last use is kept no more precisely
 
 
 def cache_directory() -> Path:
-    """Folder of the machine code: $DQ_SPACE_ARM_CACHE, or the platform's user cache folder."""
+    """Folder of the machine code: $DQ_SPACE_ARM_CACHE, or the platform's user cache folder.
+
+    A user without a home, as some containers have, gets one among the temporary files.
+    """
     configured = os.environ.get("DQ_SPACE_ARM_CACHE")
-    return Path(configured) if configured else Path(platformdirs.user_cache_dir("dq-space-arm"))
+    if configured:
+        return Path(configured)
+    try:
+        folder = Path(platformdirs.user_cache_dir("dq-space-arm"))
+    except RuntimeError:  # of recent versions; others leave "~" as it is
+        folder = Path("~")
+    return folder if folder.is_absolute() else Path(tempfile.gettempdir(), f"dq-space-arm-{os.getuid()}")
 
 
 def cache_key(*parts: str) -> str:

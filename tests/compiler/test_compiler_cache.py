@@ -28,6 +28,21 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
+@posix
+@pytest.mark.parametrize("answer", [RuntimeError("could not determine the home directory"), "~/.cache/it"])
+def test_a_user_without_a_home_has_a_cache_of_temporary_files(answer, tmp_path, monkeypatch):
+    def folder_of(name):
+        if isinstance(answer, str):
+            return answer
+        raise answer
+
+    monkeypatch.delenv("DQ_SPACE_ARM_CACHE", raising=False)
+    monkeypatch.setattr("platformdirs.user_cache_dir", folder_of)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert code_cache.cache_directory() == tmp_path / f"dq-space-arm-{os.getuid()}"
+    assert caches()["writable"]
+
+
 class Builder:
     """Builds y = factor x and counts how often it is asked to."""
 
