@@ -154,9 +154,9 @@ def test_ratios_compare_like_with_like_and_take_the_fastest_peer(short_scene: Sc
     found = {(row["what"], row["theirs"]): row["speed"] for row in ratios(short_scene, timings)}
     assert found == {
         ("dynamics, one state", "Pinocchio: aba"): 2.0,
-        ("dynamics, batch", "Pinocchio: abaInParallel"): 80.0,
-        ("rk4 step, batch", "MuJoCo: batch"): 125.0,
-        ("rk4 1,024 environments", "MuJoCo: batch"): 50.0,
-        ("rk4 64 environments", f"MuJoCo: {SYNCHRONOUS}"): 40.0,
+        ("dynamics, batch", "Pinocchio: abaInParallel, 1,024"): 80.0,
+        ("rk4 step, batch", "MuJoCo: batch, 1,024"): 125.0,
+        ("rk4 1,024 environments", "MuJoCo: batch, 1,024"): 50.0,
+        ("rk4 64 environments", f"MuJoCo: {SYNCHRONOUS}, 64"): 40.0,
         ("rk4 one environment", f"MuJoCo: {WRAPPED}"): 4.5,
     }

@@ -150,12 +150,17 @@ def ratios(scene: Scene, timings: Sequence[Row]) -> Iterator[Row]:
                 "table": "ratios",
                 "scene": scene.name,
                 "what": f"{theirs['integrator']} {what}".strip(),
-                "ours": ours["way"] + (f", {ours['batch']:,}" if ours["batch"] > 1 else ""),
+                "ours": _way(ours),
                 "ours_ns": ours["best_ns"],
-                "theirs": f"{theirs['engine']}: {theirs['way']}",
+                "theirs": f"{theirs['engine']}: {_way(theirs)}",
                 "theirs_ns": theirs["best_ns"],
                 "speed": theirs["best_ns"] / ours["best_ns"],
             }
+
+
+def _way(timing: Row) -> str:
+    size = f", {timing['batch']:,}" if timing["batch"] > 1 else ""
+    return f"{timing['way']}{size}"
 
 
 def _pairs(timings: Sequence[Row]) -> Iterator[tuple[str, Row | None, Row | None]]:
