@@ -19,6 +19,7 @@ import experts
 from agents.configuration import Configuration, ImitationConfiguration
 from agents.configuration.gradients import GradientConfiguration
 from agents.configuration.residual import ResidualConfiguration
+from agents.suite import Suite
 from agents.zoo import list_policies
 from agents.zoo.shelf import policy_file
 from dq_space_arm_env.command_line.verb import DefaultGroup
@@ -102,6 +103,12 @@ def test_scene_files_in_the_documentation_are_scenes():
     for file in files:
         scene = dq_space_arm_env.load_scene(parse_yaml(file))
         assert scene.simulation.dt == 0.015
+
+
+def test_suites_in_the_documentation_have_scenes_as_they_are():
+    (file,) = code_of(TEXTS["suite"], "yaml")
+    suite = Suite.model_validate(parse_yaml(file))
+    assert [suite.scene(task).name for task in suite.tasks] == list(suite.tasks)
 
 
 def test_table_of_scenes_is_right():

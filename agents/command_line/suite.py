@@ -45,7 +45,9 @@ _SUITE, _TASK = Named("suite", _suites), Named("task", _tasks)
     """,
 )
 @click.argument("entrants", nargs=-1, type=Named("entrant", _entrants), metavar="[ENTRANT]...")
-@click.option("--suite", "version", type=_SUITE, default="v1", show_default=True, help="Version.")
+@click.option(
+    "--suite", "version", type=_SUITE, default="v1", show_default=True, help="Version, or a YAML file."
+)
 @click.option("--task", "tasks", type=_TASK, multiple=True, help="Some of its tasks; may be repeated.")
 @click.option(
     "--seeds", type=click.IntRange(min=1), help="Trainings of an agent for a task.  [default: the suite's]"
