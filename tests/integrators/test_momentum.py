@@ -53,7 +53,7 @@ def center_of_mass(kernels, states):
 def test_internal_torques_keep_the_momentum_to_rounding(name, scene):
     kernels = compile_scene(scene)
     torques = internal_torques(kernels, 2000)
-    assert drift(kernels, slow_walk(kernels, torques, 2000, name, 10)) < 4e-14
+    assert drift(kernels, slow_walk(kernels, torques, 2000, name, 10)) < 1e-13  # 8e-14 with the payload
     # Explicit Runge-Kutta on the base's velocity is only accurate: this is no test of an arm at rest.
     by_rk4 = drift(kernels, slow_walk(kernels, torques, 2000, "rk4", 10))
     assert by_rk4 > 1e-10
