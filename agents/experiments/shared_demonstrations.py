@@ -39,7 +39,7 @@ class SharedDemonstrations:
         scene = load_scene(task.configuration.scene)
         key = _key(scene, source)
         if is_trained(task.configuration, task.folder):
-            self.remember(task)
+            self._keep(key, place)
         elif key not in self._made:
             try:
                 prepare_demonstrations(source, scene, place, executor=self._executor, progress=self._report)
@@ -52,11 +52,13 @@ class SharedDemonstrations:
 
     def remember(self, task: TrainingTask) -> None:
         """Know the demonstrations of a training, if it is finished, for others that need the same."""
-        source, place = _generated(task.configuration.resolved()), task.folder / DEMONSTRATIONS
-        if source is None or not (place / _MANIFEST).is_file():
-            return
-        if is_trained(task.configuration, task.folder):
-            self._made.setdefault(_key(load_scene(task.configuration.scene), source), place)
+        source = _generated(task.configuration.resolved())
+        if source is not None and is_trained(task.configuration, task.folder):
+            self._keep(_key(load_scene(task.configuration.scene), source), task.folder / DEMONSTRATIONS)
+
+    def _keep(self, key: str, place: Path) -> None:
+        if (place / _MANIFEST).is_file():
+            self._made.setdefault(key, place)
 
 
 def _key(scene: Scene, source: DemonstrationSource) -> str:

@@ -12,8 +12,9 @@ from dq_space_arm_env.dynamics.vector_field import split_state
 
 pytest.importorskip("mpmath")
 
+from scripts.benchmarks.peers.robot import beyond_rigid_bodies
 from scripts.benchmarks.robots import robots
-from scripts.benchmarks.stability.free_bodies import beyond_free_bodies, free_bodies
+from scripts.benchmarks.stability.free_bodies import free_bodies
 from scripts.benchmarks.stability.masses import samples
 from scripts.benchmarks.stability.reactions import LIGHTEST, acceleration_error, wrench_error
 from scripts.benchmarks.stability.references import accelerations, linear_system
@@ -32,7 +33,7 @@ def errors(scene, seed=0):
     return wrench_error(found[0], exact), acceleration_error(found[1], exact)
 
 
-@pytest.mark.parametrize("name", [name for name in robots() if not beyond_free_bodies(load_scene(name))])
+@pytest.mark.parametrize("name", [name for name in robots() if not beyond_rigid_bodies(load_scene(name))])
 def test_free_bodies_agree_with_every_shipped_robot(name):
     """Wrists, payloads, wrenches at the tip and a planar base are in both."""
     (sample,) = samples(load_scene(name), 1)

@@ -12,17 +12,22 @@ from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import FloatArray
 
 
-def beyond_the_robot(scene: Scene) -> list[str]:
-    """What a scene has besides rigid bodies on joints that turn and generalized forces, in words."""
+def beyond_rigid_bodies(scene: Scene) -> list[str]:
+    """What a scene has besides rigid bodies on joints that turn, with ideal torques and a net force."""
     actuators = scene.actuators
     has = {
         "joints that slide or turn about several axes": any(x.joint_type != "revolute" for x in scene.links),
         "motors": any(link.motor is not None for link in scene.links),
         "wheels": actuators.wheels is not None,
         "thrusters": actuators.thrusters is not None,
-        "a payload that is caught": any(phase.catch is not None for phase in scene.phases),
     }
     return [words for words, applies in has.items() if applies]
+
+
+def beyond_the_robot(scene: Scene) -> list[str]:
+    """The same for engines, which are given the robot of the start, without what it catches later."""
+    catches = any(phase.catch is not None for phase in scene.phases)
+    return beyond_rigid_bodies(scene) + ["a payload that is caught"] * catches
 
 
 @dataclass(frozen=True)

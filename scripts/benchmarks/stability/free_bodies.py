@@ -16,8 +16,8 @@ import mpmath
 import numpy as np
 from mpmath import mpf
 
-from dq_space_arm_env import Scene
 from experts.problems.shooting_problem import FloatArray
+from scripts.benchmarks.peers.robot import beyond_rigid_bodies
 from scripts.benchmarks.stability.references import DIGITS, Matrix, Sample, Vector, column, skew, turn
 
 
@@ -51,25 +51,13 @@ class _Joint:
     torque: Any  # about the z axis, N m; None where nothing moves
 
 
-def beyond_free_bodies(scene: Scene) -> list[str]:
-    """What a scene has besides rigid bodies on joints that turn, with ideal torques and a net force."""
-    actuators = scene.actuators
-    has = {
-        "a joint that is not revolute": any(link.joint_type != "revolute" for link in scene.links),
-        "a motor": any(link.motor is not None for link in scene.links),
-        "wheels": actuators.wheels is not None,
-        "thrusters": actuators.thrusters is not None,
-    }
-    return [name for name, present in has.items() if present]
-
-
 def free_bodies(sample: Sample) -> Solution:
     """Solve for the accelerations of base and joints and for the reactions of the joints.
 
     Raises:
         ValueError: If the scene has what these do not know: Pinocchio is the reference of that.
     """
-    if unknown := beyond_free_bodies(sample.scene):
+    if unknown := beyond_rigid_bodies(sample.scene):
         raise ValueError(f"scene {sample.scene.name!r} has {unknown[0]}, which these bodies do not know")
     with mpmath.workdps(DIGITS):
         bodies, joints = _cut_free(sample)
