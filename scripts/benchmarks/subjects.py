@@ -168,11 +168,7 @@ def kernel_case(
 
 
 def episodes_case(scene: Scene, copies: int = 128, decisions: int = 50) -> Case:
-    """Gradient of the episodes of an update of `apg` by the network's weights: policy, steps and both back.
-
-    Raises:
-        ModuleNotFoundError: If the extra `agents` is not installed.
-    """
+    """Gradient by the weights of the episodes of an update of `apg`: policy, steps and both back."""
     from threadpoolctl import ThreadpoolController
 
     from agents.gradients.episodes import Episodes, decision_times

@@ -18,7 +18,6 @@ from scripts.benchmarks.subjects import (
     COMPARED_INTEGRATORS,
     DYNAMICS,
     ENVIRONMENT,
-    EPISODES,
     FLOAT64,
     GOALS,
     GRADIENT,
@@ -78,11 +77,8 @@ def measure_scene(scene: Scene, effort: Effort, peaks: Mapping[str, float]) -> I
         *function_cases(scene, sizes),
         *environment_cases(scene, sizes),
         *goal_cases(scene, (SYNCHRONOUS_COPIES, TRAINING_COPIES)),
+        episodes_case(scene),
     ]
-    try:
-        cases.append(episodes_case(scene))
-    except ModuleNotFoundError as error:
-        yield note(f"{EPISODES}: left out, {error.name} is not installed")
     for peer in peers:
         cases += peer.cases(*moving_states(kernels, TRAINING_COPIES))
     timings = [_row(scene, timing, peaks) for timing in time_cases(cases, effort.kernel_timing)]
