@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.configuration.gradients import FlightMismatch
+from agents.gradients.episode_loops import Arrivals
 from dq_space_arm_env import Scene
 from dq_space_arm_env.scene import StateLayout
 
@@ -51,47 +52,31 @@ def calm(count: int) -> int:
     return (count + 1) // 2
 
 
-class Arrival(NamedTuple):
-    """Which outputs act in a decision: the newest that has arrived, and its difference to the one before."""
-
-    newest: Any  # index of a decision, or (B,)
-    before: Any
-    ahead: Any  # in units of the time between these two, or (B, 1)
-    arrived: Any  # 0 where nothing has, (B, 1); otherwise 1
-    rows: Any  # of episodes: all, or (B,)
-
-    def of(self, outputs: Array) -> Array:
-        """Outputs (B, n) that act, of all decisions' (K, B, n)."""
-        newest = outputs[self.newest, self.rows]
-        return np.asarray(newest + self.ahead * (newest - outputs[self.before, self.rows]))
-
-    def back(self, cotangent: Array, by_output: Array) -> None:
-        """Add what the cotangent (B, n) of `of` adds to those of all outputs, (K, B, n)."""
-        cotangent, ahead = cotangent * self.arrived, np.float64(self.ahead)
-        by_output[self.newest, self.rows] += (1.0 + ahead) * cotangent
-        by_output[self.before, self.rows] -= ahead * cotangent
-
-
-def arrivals(times: Array, dt: float, firsts: Sequence[int], delays: Array | None = None) -> list[Arrival]:
-    """What acts in each decision, by the times of decisions (K + 1,), the time step, and delays (B,), s.
+def arrivals(
+    times: Array, dt: float, firsts: Sequence[int], count: int, delays: Array | None = None
+) -> Arrivals:
+    """Which outputs act in the decisions of B episodes.
 
     Flights hold each action for a time step: on average over a decision, they act with the output of half
     a step before its middle. Without delays, the first decisions of phases extrapolate nothing.
+
+    Args:
+        times: Those of the decisions and of the end, s, shape (K + 1,).
+        dt: The time step, s.
+        firsts: First decision of each phase.
+        count: B.
+        delays: From an output to its effect, s, shape (B,); None for none.
     """
-    means, found = 0.5 * (times[:-1] + times[1:] - dt), []
-    for k, mean in enumerate(means):
-        if delays is None:
-            newest, wanted = np.array(k), np.array(mean)
-        else:
-            wanted = mean - delays
-            newest = np.minimum(np.searchsorted(times, wanted), k)
-        before = np.maximum(newest - (delays is not None or k not in firsts), 0)
-        between = times[newest] - times[before]
-        ahead = np.where(between > 0.0, wanted - times[newest], 0.0) / np.where(between > 0.0, between, 1.0)
-        ahead = ahead.astype(np.float32)
-        if delays is None:
-            found.append(Arrival(k, int(before), np.float32(ahead), 1.0, slice(None)))
-        else:
-            arrived = (wanted >= 0.0).astype(np.float64)[:, None]
-            found.append(Arrival(newest, before, ahead[:, None], arrived, np.arange(len(delays))))
-    return found
+    wanted = np.repeat(0.5 * (times[:-1] + times[1:] - dt)[:, None], count, axis=1)
+    own = np.arange(len(wanted))[:, None]
+    if delays is None:
+        newest = np.repeat(own, count, axis=1)
+        before = newest - ~np.isin(newest, firsts)
+    else:
+        wanted -= delays
+        newest = np.minimum(np.searchsorted(times, wanted), own)
+        before = np.maximum(newest - 1, 0)
+    between = times[newest] - times[before]
+    ahead = np.where(between > 0.0, wanted - times[newest], 0.0) / np.where(between > 0.0, between, 1.0)
+    arrived = (wanted >= 0.0) | (delays is None)
+    return Arrivals(newest, before, ahead.astype(np.float32), arrived.astype(np.float64))

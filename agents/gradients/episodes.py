@@ -11,22 +11,35 @@ a decision errs, it is divided into substeps; where phases change parameters, a 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.gradients.disturbed_flights import Arrival, Met, arrivals
-from agents.gradients.layers import Layers, SingleArray
+from agents.gradients.disturbed_flights import Met, arrivals
+from agents.gradients.episode_loops import (
+    Call,
+    Calls,
+    Flown,
+    Slopes,
+    add_alternation,
+    add_slopes_of_roughness,
+    fly_decisions,
+    trace_back_decisions,
+)
+from agents.gradients.layers import Layers
 from agents.gradients.penalties import Penalties
 from dq_space_arm_env import Scene, compile_scene
-from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.kernels.bound import KernelCall, address_of
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 from experts.problems.arm_problem import misses
 
 Array = NDArray[Any]
+
+END_BACK = PENALIZED + "emphasized_terminal_cost_vjp"
 
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
 STEEP = 10.0  # times the slope that usual episodes do not exceed; slopes beyond it are shortened
@@ -66,7 +79,7 @@ def first_decisions(scene: Scene, times: Array) -> list[int]:
 
 
 class Episodes:
-    """B episodes of K decisions: their arrays, and kernels bound to these.
+    """B episodes of K decisions: their arrays, and tables of these for the kernels.
 
     Attributes:
         substeps: Equal integration steps of each decision, shape (K,); see `divide`.
@@ -81,10 +94,10 @@ class Episodes:
     ) -> None:
         """Prepare episodes whose network gives its outputs in some units, alike or not for all inputs."""
         self._kernels = kernels = compile_scene(scene)
-        self._layers, (decisions, count, n_obs) = layers, layers.values[0].shape
+        self._layers, (decisions, count, n_obs) = layers, layers.shape
         self.substeps, self._times = np.ones(decisions, int), times
         dtype, layout = kernels.dtype, kernels.layout
-        self.units, self._efforts = np.full(kernels.n_u, units, np.float64), layout.control_weight
+        self.units = np.full(kernels.n_u, units, np.float64)
         self._relative = self.units / self.units.max()  # of the inputs of one actuator
         actuators = (getattr(layout.control, name) for name in CONTROL_UNITS)
         self._actuators = [entries for entries in actuators if entries.start < entries.stop]
@@ -96,41 +109,65 @@ class Episodes:
             # The sum over time steps has a phase's first and last state whole, but not that at the very end.
             self._weights[first] += 0.5
             self._weights[end - 1] += -0.5 if last else 0.5
-        self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
         self.penalties = Penalties(kernels, decisions, count, self._weights[-1])
-        self._states = np.zeros((decisions + 1, count, kernels.n_x), dtype)
+
+        def zeros(*shape: int) -> Array:
+            return np.zeros((*shape[:-1], count, shape[-1]), dtype)
+
+        self._states, self._costs = zeros(decisions + 1, kernels.n_x), zeros(decisions + 1, 1)
         self._measured = np.zeros_like(self._states) if noisy else self._states
-        self._observations = np.zeros((decisions, count, n_obs), dtype)
-        self._wanted = np.zeros((decisions, count, kernels.n_u), dtype)
-        self._inputs = np.zeros((decisions + 1, count, kernels.n_u), dtype)
-        self._costs = np.zeros((decisions + 1, count, 1), dtype)
-        self._terminal, self._emphasis = np.zeros((2, count, 1), dtype)
-        self._cotangents = np.zeros((decisions + 1, count, kernels.n_t), dtype)
-        self._by_input, self._by_held = np.zeros((2, count, kernels.n_u), dtype)
-        # New arrays of this size in every update would take longer than what is computed in them.
-        self._by_output, self._rough, self._outputs, second = np.zeros((4, decisions, count, kernels.n_u))
-        self._second = second[:-2]
-        self._by_observation = np.zeros((count, n_obs), dtype)
-        self._by_state = np.zeros((count, kernels.n_t), dtype)
+        self._terminal, self._emphasis, self._by_state = zeros(1), zeros(1), zeros(kernels.n_t)
         self._cost_weights = np.repeat(self._weights[:, None, None], count, axis=1).astype(dtype)
-        self._calls: list[dict[str, KernelCall]] = []
-        self._further: list[list[tuple[KernelCall, KernelCall]]] = []
+        self._flown = Flown(
+            observations=zeros(decisions, n_obs),
+            wanted=zeros(decisions, kernels.n_u),
+            inputs=zeros(decisions + 1, kernels.n_u),
+            **dict.fromkeys(("mean", "scale", "units", "low", "high"), np.empty(0)),
+            held=steps / dt - self._weights[:-1],  # the input's cost is not of a point in time
+            efforts=np.array(layout.control_weight),
+            spent=np.zeros(count),
+        )
+        self._inputs = self._flown.inputs
+        self._slopes = Slopes(
+            by_state=zeros(decisions + 1, kernels.n_t),
+            by_output=np.zeros((decisions, count, kernels.n_u)),
+            by_input=zeros(kernels.n_u),
+            by_held=zeros(kernels.n_u),
+            by_inputs=zeros(kernels.n_u),
+            by_observation=zeros(n_obs),
+            by_observed=zeros(kernels.n_t),
+            lost=np.zeros(count, np.bool_),
+            sizes=np.zeros(count),
+            ordered=np.zeros(count),
+        )
+        self._cotangents = self._slopes.by_state
         self.divide(self.substeps)
         self._end = self._bind_end()
         self.roughness = ROUGH
         self._met, self._usual, self._firsts, self._dt = Met(), USUAL, firsts, dt
-        self._inner = np.ones((decisions - 2, 1, 1))  # whether both neighbours are of the same phase
+        self._inner = np.ones(decisions - 2)  # whether both neighbours are of the same phase
         for first in firsts[1:]:
             self._inner[max(first - 2, 0) : first] = 0.0
-        self._arrivals: list[Arrival] = arrivals(times, dt, firsts)
+        self._arrivals = arrivals(times, dt, firsts, count)
 
     def divide(self, substeps: Array) -> None:
         """Divide decisions into equal integration steps, (K,), that hold the input."""
         self.substeps = substeps
         chains = [self._chain(k) for k in range(len(substeps))]
-        self._calls = [self._bind(k, states, slopes) for k, (states, slopes) in enumerate(chains)]
-        self._further = [self._bind_further(k, states, slopes) for k, (states, slopes) in enumerate(chains)]
+        first = [self._first_arrays(k, *chain) for k, chain in enumerate(chains)]
+        further = [arrays for k, chain in enumerate(chains) for arrays in self._further_arrays(k, *chain)]
+        self._kept = first, further  # alive: the tables hold their addresses
+        is_constrained = self.penalties.is_constrained
+        self._calls = Calls(
+            observation=self._call("observation", first),
+            step=self._call("step_with_cost", first),
+            step_back=self._call("step_with_cost_vjp", first, is_penalized=is_constrained),
+            observation_back=self._call("observation_vjp", first),
+            further_step=self._call("step", further),
+            further_step_back=self._call("vjp", further),
+            further_begins=np.append(0, np.cumsum(substeps - 1)),
+        )
 
     def _chain(self, k: int) -> tuple[list[Array], list[Array]]:
         """States of a decision's substeps, first and last included, and their cotangents."""
@@ -142,75 +179,73 @@ class Episodes:
         )
         return states, slopes
 
+    def _first_arrays(self, k: int, states: list[Array], slopes: list[Array]) -> dict[str, dict[str, Array]]:
+        """Arrays of a decision by kernel and name, those of further substeps left out."""
+        count, dtype, times, ways = self._states.shape[1], self._kernels.dtype, self._times, self._slopes
+        left = np.full((count, 1), times[-1] - times[k], dtype)
+        given = {"u": self._inputs[k], "h": self._substep(k), "parameters": self.parameters[k]}
+        seen = {**given, "x": self._measured[k], "time_left": left}
+        step = {**given, "x": states[0], "x_next": states[1], "cost": self._costs[k]}
+        back = {**given, "x": states[0], "v": slopes[1], "v_cost": self._cost_weights[k]}
+        back |= {"x_cotangent": slopes[0], "u_cotangent": ways.by_input}
+        if self.penalties.is_constrained:
+            back["parameters"] = self.penalties.parameters[k]
+        errors = np.zeros((count, 2), dtype)
+        return {
+            "observation": {**seen, "observation": self._flown.observations[k], "errors": errors},
+            "step_with_cost": step,
+            "step_with_cost_vjp": back,
+            "observation_vjp": {**seen, "v": ways.by_observation, "x_cotangent": ways.by_observed},
+        }
+
+    def _further_arrays(
+        self, k: int, states: list[Array], slopes: list[Array]
+    ) -> Iterator[dict[str, dict[str, Array]]]:
+        """Arrays of a decision's substeps after the first, by kernel and name."""
+        given = {"u": self._inputs[k], "h": self._substep(k), "parameters": self.parameters[k]}
+        for index in range(1, self.substeps[k]):
+            step = {**given, "x": states[index], "x_next": states[index + 1]}
+            back = {**given, "x": states[index], "v": slopes[index + 1], "x_cotangent": slopes[index]}
+            yield {"step": step, "vjp": {**back, "u_cotangent": self._slopes.by_held}}
+
     def _substep(self, k: int) -> Array:
         """Length of a decision's substeps, s, (1,)."""
         length = (self._times[k + 1] - self._times[k]) / self.substeps[k]
         return np.array([length], self._kernels.dtype)
 
-    def _bind_further(
-        self, k: int, states: list[Array], slopes: list[Array]
-    ) -> list[tuple[KernelCall, KernelCall]]:
-        """The calls of a decision's substeps after the first, forward and back."""
-        given = {"u": self._inputs[k], "h": self._substep(k), "parameters": self.parameters[k]}
-        found = []
-        for index in range(1, self.substeps[k]):
-            arrays = {**given, "x": states[index], "x_next": states[index + 1], "v": slopes[index + 1]}
-            arrays |= {"x_cotangent": slopes[index], "u_cotangent": self._by_held}
-            step, back = (KernelCall(self._kernels.kernel(name), arrays) for name in ("step", "vjp"))
-            found.append((step, back))
-        return found
-
-    def _bind(self, k: int, states: list[Array], slopes: list[Array]) -> dict[str, KernelCall]:
-        """The calls of a decision, those of further substeps left out."""
-        count, dtype, times = self._states.shape[1], self._kernels.dtype, self._times
-        given = {
-            "x": states[0],
-            "u": self._inputs[k],
-            "h": self._substep(k),
-            "parameters": self.parameters[k],
-            "time_left": np.full((count, 1), times[-1] - times[k], dtype),
-        }
-        after = {"x_next": states[1], "cost": self._costs[k]}
-        seen = {"x": self._measured[k], "observation": self._observations[k]}
-        seen |= {"errors": np.zeros((count, 2), dtype)}
-        back = {"v": slopes[1], "v_cost": self._cost_weights[k]}
-        back |= {"x_cotangent": slopes[0], "u_cotangent": self._by_input}
-        by_observation = {"x": self._measured[k], "v": self._by_observation, "x_cotangent": self._by_state}
-        arrays = {
-            "observation": seen,
-            "step_with_cost": after,
-            "step_with_cost_vjp": back,
-            "observation_vjp": by_observation,
-        }
-        return {name: self._call(name, k, given | others) for name, others in arrays.items()}
-
-    def _call(self, name: str, k: int, arrays: dict[str, Array]) -> KernelCall:
-        """A kernel on arrays; slopes of costs have those of the penalties."""
-        along = self.penalties.is_constrained and name == "step_with_cost_vjp"
-        if along or name == "emphasized_terminal_cost_vjp":
-            name, arrays = PENALIZED + name, {**arrays, "parameters": self.penalties.parameters[k]}
-        return KernelCall(self._kernels.kernel(name), arrays)
+    def _call(
+        self, name: str, arrays: Sequence[Mapping[str, Mapping[str, Array]]], *, is_penalized: bool = False
+    ) -> Call:
+        """A kernel on the arrays of decisions or substeps; none is compiled where there are none."""
+        if not arrays:
+            return Call(0, np.zeros((0, 0), np.int64))
+        kernel = self._kernels.kernel(PENALIZED + name if is_penalized else name)
+        names = [spec.name for spec in (*kernel.inputs, *kernel.outputs)]
+        return Call(
+            kernel.address, np.array([[address_of(each[name][key]) for key in names] for each in arrays])
+        )
 
     def _bind_end(self) -> dict[str, KernelCall]:
         """The calls at the end, where the inputs are zero."""
         one = np.ones_like(self._terminal)
         given = {"x": self._states[-1], "u": self._inputs[-1], "parameters": self.parameters[-1]}
         given |= {"emphasis": self._emphasis}
+        penalized = {"parameters": self.penalties.parameters[-1]}
+        by_state = {"v": self._cost_weights[-1], "x_cotangent": self._by_state}
         arrays = {
             "cost": {"cost": self._costs[-1]},
             "emphasized_terminal_cost": {"cost": self._terminal},
-            "cost_vjp": {
-                "v": self._cost_weights[-1],
-                "x_cotangent": self._by_state,
-                "u_cotangent": self._by_input,
-            },
-            "emphasized_terminal_cost_vjp": {"v": one, "x_cotangent": self._cotangents[-1]},
+            "cost_vjp": {**by_state, "u_cotangent": self._slopes.by_input},
+            END_BACK: {"v": one, "x_cotangent": self._cotangents[-1], **penalized},
         }
-        return {name: self._call(name, -1, given | others) for name, others in arrays.items()}
+        return {
+            name: KernelCall(self._kernels.kernel(name), given | others) for name, others in arrays.items()
+        }
 
     def meet(self, met: Met) -> None:
         """Let delays, jumps and noise disturb the next flights."""
-        self._met, self._arrivals = met, arrivals(self._times, self._dt, self._firsts, met.delays)
+        count = self._states.shape[1]
+        self._met, self._arrivals = met, arrivals(self._times, self._dt, self._firsts, count, met.delays)
         self._usual = USUAL_DISTURBED
 
     @np.errstate(over="ignore", invalid="ignore")  # of episodes that diverge
@@ -221,29 +256,28 @@ class Episodes:
         """
         self._states[0], self._emphasis[:] = starts, emphasis
         self.penalties.prepare(self.parameters, emphasis)
-        rows, layout = len(starts), self._kernels.layout
+        self._layers.prepare()
+        rows, decisions, layout = len(starts), len(self.substeps), self._kernels.layout
         # Phases change limits.
         high = layout.limits_with(self.parameters if self._kernels.parameters.staged else self.parameters[:1])
         every = len(self.parameters), *high.shape[1:]
-        self._low, self._high = (np.broadcast_to(each, every) for each in (layout.lower_limits(high), high))
-        units = np.broadcast_to(self.units * high, every)
-        for k, calls in enumerate(self._calls):
-            self._disturb(k)
-            calls["observation"](rows)
-            np.subtract(self._observations[k], mean, out=self._by_observation)
-            np.multiply(self._by_observation, scale, out=self._layers.values[0][k])
-            self._layers.forward(k)
-            arrival = self._arrivals[k]
-            np.multiply(arrival.of(self._layers.values[-1]), units[k] * arrival.arrived, out=self._wanted[k])
-            np.maximum(self._wanted[k], self._low[k], out=self._inputs[k])  # `numpy.clip` takes twice as long
-            np.minimum(self._inputs[k], self._high[k], out=self._inputs[k])
-            calls["step_with_cost"](rows)
-            for step, _ in self._further[k]:
-                step(rows)
+        units, low, high = (  # copies, as loops are compiled for arrays that may be written to
+            np.array(np.broadcast_to(each, every), np.float64, order="C")
+            for each in (self.units * high, layout.lower_limits(high), high)
+        )
+        mean, scale = np.array(mean, np.float64), np.array(scale, np.float64)
+        self._flown = self._flown._replace(mean=mean, scale=scale, units=units, low=low, high=high)
+        self._flown.spent[:] = 0.0
+        given = self._calls, self._layers.network, self._arrivals, self._flown
+        if self._met.jumps is None and self._measured is self._states:
+            fly_decisions(0, decisions, *given)
+        else:
+            for k in range(decisions):
+                self._disturb(k)
+                fly_decisions(k, k + 1, *given)
         self._end["cost"](rows)
         self._end["emphasized_terminal_cost"](rows)
-        efforts = np.square(self._inputs[:-1]) @ self._efforts
-        total = self._weights @ self._costs[..., 0] + self._held @ efforts + self._terminal[:, 0]
+        total = self._weights @ self._costs[..., 0] + self._flown.spent + self._terminal[:, 0]
         return np.asarray(total)
 
     def _disturb(self, k: int) -> None:
@@ -259,7 +293,7 @@ class Episodes:
 
     def gradient(
         self, starts: Array, mean: Array, scale: Array, emphasis: float
-    ) -> tuple[list[SingleArray], Array]:
+    ) -> tuple[list[Array], Array]:
         """Exact gradient of the mean cost by the network's weights, and the costs of `fly`.
 
         The gradient, not the costs, has the penalties of constraints and of roughness. Episodes that
@@ -271,69 +305,22 @@ class Episodes:
         typical = float(np.median(costs[finite])) if finite.any() else 0.0
         lost = ~finite | (costs > DIVERGED * typical)
         rows, kept = len(starts), max(1, len(starts) - int(lost.sum()))
-        if any_lost := bool(lost.any()):
-            for values in self._layers.values:
-                values[:, lost] = 0.0
-        self._end["emphasized_terminal_cost_vjp"](rows)
+        if lost.any():
+            self._layers.forget(lost)
+        self._slopes.lost[:] = lost
+        self._end[END_BACK](rows)
         self._end["cost_vjp"](rows)
         self._cotangents[-1] += self._by_state
         self._cotangents[-1][lost] = 0.0
-        self._by_output[:] = 0.0
-        by_roughness = self._by_roughness(typical / kept)
-        # What does not depend on slopes, for all decisions at once.
-        decisions = len(self._calls)
-        by_effort = 2.0 * self._held[:, None, None] * self._efforts * self._inputs[:-1]
-        above, below = (self._wanted > self._high[:decisions]), (self._wanted < self._low[:decisions])
-        is_limited: Array = np.any(above | below, axis=(1, 2))
-        units, scales = self.units * self._high / kept, scale * kept
-        # Late outputs of one phase may act in the next, whose limits are others.
-        is_late = self._met.delays is not None and len(self._firsts) > 1
+        self._slopes.by_output[:] = 0.0
+        if self._met.jumps is None and self._met.noise is None:  # which make outputs rough with good reason
+            # A smooth policy pays the fourth power of the steps.
+            weights = 2.0 * self.roughness * typical / (kept * len(self.substeps)) * self._inner
+            add_slopes_of_roughness(self._slopes.by_output, self._layers.network.outputs, self.units, weights)
         steep = STEEP_PENALTIES if self.penalties.are_strict else STEEP
-        for k in range(decisions - 1, -1, -1):
-            further: Array | float = 0.0
-            for _, reverse in reversed(self._further[k]):
-                reverse(rows)
-                further = further + self._by_held
-            self._calls[k]["step_with_cost_vjp"](rows)
-            if self._further[k]:
-                self._by_input += further
-            slope = np.add(self._by_input, by_effort[k], out=by_effort[k])
-            if is_limited[k]:  # beyond a limit only what leads back counts
-                slope[(above[k] & (slope < 0.0)) | (below[k] & (slope > 0.0))] = 0.0
-            if any_lost:
-                slope[lost] = 0.0
-            self._arrivals[k].back(slope * units[k] if is_late else slope, self._by_output)
-            by_output = self._by_output[k] if is_late else self._by_output[k] * units[k]
-            back = self._layers.backward(k, by_output + by_roughness[k])
-            np.multiply(back, scales, out=self._by_observation)
-            self._calls[k]["observation_vjp"](rows)
-            self._cotangents[k] += self._by_state
-            if any_lost:
-                self._cotangents[k][lost] = 0.0
-            _shorten(self._cotangents[k], steep, self._usual)
+        given = self._calls, self._layers.network, self._arrivals, self._flown
+        trace_back_decisions(*given, self._slopes, kept, steep, self._usual)
         return self._layers.gradient(), costs
-
-    def _by_roughness(self, cost: float) -> Array:
-        """Slopes by the outputs, (K, B, n_u), of a penalty of their second differences.
-
-        Without it policies learn to alternate from decision to decision, which no flight at every time step
-        does. A smooth policy pays the fourth power of the steps; jumps and noise go unpunished.
-        """
-        slopes, second = self._rough, self._second
-        if self._met.jumps is not None or self._met.noise is not None:
-            return slopes
-        outputs = np.multiply(self._layers.values[-1], self.units, out=self._outputs)
-        np.multiply(outputs[1:-1], -2.0, out=second)
-        second += outputs[2:]
-        second += outputs[:-2]
-        second *= 2.0 * self.roughness * cost / len(slopes) * self._inner
-        slopes[:-2], slopes[-2:] = second, 0.0
-        second *= 2.0
-        slopes[1:-1] -= second
-        second *= 0.5
-        slopes[2:] += second
-        slopes *= self.units
-        return slopes
 
     def price_violations(self, cost: float, judged: int) -> None:
         """Let penalties follow what the episodes flown last violate, and the cost of recent ones.
@@ -351,10 +338,10 @@ class Episodes:
 
         Episodes that diverge, whose inputs are not numbers, do not hide that others alternate.
         """
-        changes = np.diff(self._inputs[:-1] / self._kernels.layout.control_limit, axis=0)
-        before, after = changes[:-1], changes[1:]
-        back = np.maximum(np.minimum(before, -after), np.minimum(-before, after))  # the smaller of the two
-        alternates = (np.fmax(back, 0.0) * self._inner).mean(axis=(0, 1)) > ALTERNATING
+        alternation = np.zeros(len(self.units))
+        add_alternation(alternation, self._inputs[:-1], self._inner)
+        count = len(self._inner) * self._inputs.shape[1]
+        alternates = alternation / count > ALTERNATING * self._kernels.layout.control_limit
         factor = ROUGHER if alternates.any() else SMOOTHER
         self.roughness = min(max(self.roughness * factor, ROUGH), ROUGHEST)
 
@@ -364,18 +351,23 @@ class Episodes:
         Errors of the steps, by steps half as long, times the slope of the cost behind them; infinite where
         no episode comes through.
         """
-        kernels, found = self._kernels, np.full(len(self._calls), math.inf)
+        kernels, found = self._kernels, np.full(len(self.substeps), math.inf)
+        step, halved = kernels.kernel("step"), np.empty_like(self._states[1:])
         for k, count in enumerate(2 * self.substeps):
-            states, p = self._states[k], self.parameters[k] if kernels.n_p else None
+            given = {"u": self._inputs[k], "h": self._substep(k) / 2.0, "parameters": self.parameters[k]}
+            x = self._states[k]
             for _ in range(count):
-                states = kernels.step(states, self._inputs[k], float(self._substep(k)[0]) / 2.0, p=p)
-            errors = kernels.difference(states, self._states[k + 1]) * self._cotangents[k + 1]
-            with np.errstate(invalid="ignore"):  # of episodes that diverge
-                sizes = np.abs(errors.sum(axis=1))
-            if self._met.jumps is not None and k + 1 < len(self._calls):
-                sizes[self._met.jumps[k + 1].any(axis=1)] = math.nan
-            if np.isfinite(sizes).any():
-                found[k] = sizes[np.isfinite(sizes)].mean()
+                KernelCall(step, {**given, "x": x, "x_next": halved[k]})(len(x))
+                x = halved[k].copy()
+        ends = (np.reshape(each, (-1, kernels.n_x)) for each in (halved, self._states[1:]))
+        errors = kernels.difference(*ends).reshape(self._cotangents[1:].shape) * self._cotangents[1:]
+        with np.errstate(invalid="ignore"):  # of episodes that diverge
+            sizes = np.abs(errors.sum(axis=-1))
+        if self._met.jumps is not None:
+            sizes[:-1][self._met.jumps[1:].any(axis=-1)] = math.nan
+        for k, each in enumerate(sizes):
+            if np.isfinite(each).any():
+                found[k] = each[np.isfinite(each)].mean()
         return found
 
     def misses(self) -> Array:
@@ -391,20 +383,3 @@ class Episodes:
         for entries in self._actuators:
             squares[entries] = squares[entries].mean()
         return np.asarray(self._relative * np.sqrt(squares))
-
-
-def _shorten(slopes: Array, steep: float, share: float) -> None:
-    """Shorten rows many times longer than a share of them, as chaotic motions have; drop those not finite."""
-    # Columns side by side, and a quantile by hand, take a fraction of the time for a few numbers.
-    sizes = np.abs(slopes.T, order="C").max(axis=0)
-    ordered, count = np.sort(sizes), len(sizes)  # finite ones first
-    finite: Any = True
-    if not math.isfinite(ordered[-1]):
-        finite = np.isfinite(sizes)
-        count = int(np.count_nonzero(finite))
-        slopes[~finite] = 0.0
-    place = share * (count - 1)
-    most = steep * 0.5 * (ordered[math.floor(place)] + ordered[math.ceil(place)]) if count else 0.0
-    if count and ordered[count - 1] > most:
-        long = finite & (sizes > most)
-        slopes[long] *= (most / sizes[long])[:, None]

@@ -1,4 +1,4 @@
-"""The layers of a policy in NumPy, in single precision, with their gradients over whole episodes."""
+"""The layers of a policy, and the gradients by their weights over whole episodes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.gradients.episode_loops import Network
+from experts.native.vector_code import LANES
+
+Array = NDArray[Any]
 SingleArray = NDArray[np.float32]
+ROW = 8 * LANES  # bytes of a vector; rows are whole ones
 FIRST_OUTPUTS = 0.01  # size of the last layer relative to the others at first, to start near rest
 
 
@@ -25,49 +30,60 @@ def random_weights(sizes: Sequence[int], rng: np.random.Generator) -> list[Singl
 
 
 class Layers:
-    """A network with tanh between its layers, evaluated for K decisions of B episodes.
+    """A network with tanh between its layers, evaluated for K decisions of B episodes by `episode_loops`.
 
     What each decision computes is kept: gradients by the weights are then one product for all decisions.
+
+    Attributes:
+        weights: Matrix and bias of each layer in turn.
+        shape: Numbers of decisions, episodes, and inputs.
+        outputs: Those of the last flight, shape (K, B, n).
+        network: Its arrays, padded; valid after `prepare`.
     """
 
-    def __init__(self, weights: Sequence[SingleArray], decisions: int, episodes: int) -> None:
+    def __init__(self, weights: Sequence[Array], decisions: int, episodes: int) -> None:
         """Take weights as `random_weights` gives them; they are shared, and changed in place by the owner."""
-        self.weights = weights
+        self.weights, dtype = weights, weights[0].dtype
         sizes = [len(weights[0]), *(len(bias) for bias in weights[1::2])]
-        self.values: list[SingleArray] = [np.zeros((decisions, episodes, size), np.float32) for size in sizes]
-        self._cotangents: list[SingleArray] = [
-            np.zeros((decisions, episodes, size), np.float32) for size in sizes
-        ]
-        self._last = len(sizes) - 1
-        self._ones = np.ones(decisions * episodes, np.float32)  # NumPy sums along the first axis more slowly
+        self.shape = decisions, episodes, sizes[0]
+        columns = [-(-size // (ROW // dtype.itemsize)) * (ROW // dtype.itemsize) for size in sizes]
 
-    def forward(self, decision: int) -> SingleArray:
-        """Outputs (B, n) of the inputs that `values[0]` holds for a decision."""
-        for index in range(self._last):
-            result = self.values[index + 1][decision]
-            np.matmul(self.values[index][decision], self.weights[2 * index], out=result)
-            result += self.weights[2 * index + 1]
-            if index + 1 < self._last:
-                np.tanh(result, out=result)
-        outputs: SingleArray = self.values[-1][decision]
-        return outputs
+        def zeros(*shape: int) -> Array:
+            return np.zeros(shape, dtype)
 
-    def backward(self, decision: int, cotangent: NDArray[Any]) -> SingleArray:
-        """From the outputs' cotangents of a decision to those of its inputs, (B, n)."""
-        self._cotangents[-1][decision] = cotangent
-        for index in range(self._last, 0, -1):
-            slope, value = self._cotangents[index][decision], self.values[index][decision]
-            if index < self._last:
-                of_tanh = value * value
-                slope *= np.subtract(1.0, of_tanh, out=of_tanh)
-            np.matmul(slope, self.weights[2 * index - 2].T, out=self._cotangents[index - 1][decision])
-        inputs: SingleArray = self._cotangents[0][decision]
-        return inputs
+        values, cotangents = (tuple(zeros(decisions, episodes, count) for count in columns) for _ in range(2))
+        self.network = Network(
+            values=values,
+            cotangents=cotangents,
+            matrices=tuple(zeros(size, count) for size, count in zip(sizes, columns[1:], strict=False)),
+            transposes=tuple(zeros(size, count) for size, count in zip(sizes[1:], columns, strict=False)),
+            biases=tuple(zeros(count) for count in columns[1:]),
+            zeros=zeros(max(columns)),
+            outputs=values[-1],
+            by_outputs=cotangents[-1],
+        )
+        self.outputs = values[-1][..., : sizes[-1]]
+        self._ones = np.ones(decisions * episodes, dtype)  # NumPy sums along the first axis more slowly
 
-    def gradient(self) -> list[SingleArray]:
-        """Gradients by all weights, summed over decisions and episodes; after `backward` of all decisions."""
-        found: list[SingleArray] = []
-        for values, cotangents in zip(self.values, self._cotangents[1:], strict=False):
-            rows = cotangents.reshape(-1, cotangents.shape[-1])
-            found += [values.reshape(len(rows), -1).T @ rows, self._ones @ rows]
+    def prepare(self) -> None:
+        """Take over what the owner has changed of the weights."""
+        network = self.network
+        for index, (matrix, bias) in enumerate(zip(self.weights[::2], self.weights[1::2], strict=True)):
+            network.matrices[index][:, : len(bias)] = matrix
+            network.transposes[index][:, : len(matrix)] = matrix.T
+            network.biases[index][: len(bias)] = bias
+
+    def forget(self, episodes: NDArray[np.bool_]) -> None:
+        """Set to zero what some episodes (B,) have computed."""
+        for values in self.network.values:
+            values[:, episodes] = 0.0
+
+    def gradient(self) -> list[Array]:
+        """Gradients by all weights, summed over decisions and episodes; after the way back."""
+        found: list[Array] = []
+        network, matrices = self.network, self.weights[::2]
+        for values, cotangents, matrix in zip(network.values, network.cotangents[1:], matrices, strict=False):
+            given, slopes = (each.reshape(-1, each.shape[-1]) for each in (values, cotangents))
+            rows, columns = matrix.shape  # without padding
+            found += [(given.T @ slopes)[:rows, :columns], (self._ones @ slopes)[:columns]]
         return found

@@ -1,4 +1,4 @@
-"""How numba compiles the solver's loops, and how they call native kernels.
+"""How numba compiles loops, the solver's above all, and how they call native kernels.
 
 A kernel is a C function ``void kernel(int64 begin, int64 end, const int64 *buffers)``. The table of a
 `buffer_table` holds the addresses of C-contiguous float64 arrays; for every row k in [begin, end) the kernel
@@ -70,8 +70,9 @@ def _cached(dispatcher: Any, loop: Loop) -> Loop:
     compile_loop = dispatcher._compiler.compile
 
     def compile_aloud(*signature: Any) -> Any:
-        announce("the solver", if_first=True)
-        with compiling(lambda: f"{loop.__name__.strip('_')} of the solver"):
+        package = loop.__module__.partition(".")[0]
+        announce(f"the code of {package}", if_first=True)
+        with compiling(lambda: f"{loop.__name__.strip('_')} of {package}"):
             return compile_loop(*signature)
 
     dispatcher._compiler.compile = compile_aloud

@@ -11,7 +11,7 @@ from numba.core import cgutils
 from dq_space_arm_env.common.host_machine import host_machine
 
 LANES = host_machine().lanes
-"""Numbers in one vector register of this processor."""
+"""Numbers in double precision in one vector register of this processor; twice as many in single."""
 
 TILE_ROWS = 3
 """Rows of a tile."""
@@ -19,20 +19,29 @@ TILE_VECTORS = 5 if LANES == 8 else 3
 """Most vectors in a row of a tile: nine sums hide the latency of an addition and fit in sixteen registers;
 processors with vectors of eight numbers have 32."""
 
-VECTOR = ir.VectorType(ir.DoubleType(), LANES)
-ZERO = ir.Constant(VECTOR, [0.0] * LANES)
-
 _INT32 = ir.IntType(32)
 _CONTRACT = ("contract",)
 
 
 class Emitter:
-    """Emits the code of one call of an intrinsic; arguments are addressed by position."""
+    """Emits the code of one call of an intrinsic; arguments are addressed by position.
+
+    Attributes:
+        lanes: How many numbers, of the type of the first argument, an array, are in a vector.
+        vector: Type of a vector.
+        zero: Vector of zeros.
+    """
 
     def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
         self.context, self.builder, self.arguments = context, builder, arguments
         self.index = context.get_value_type(types.intp)
         self._types = signature.args
+        number = signature.args[0].dtype
+        self._bytes = number.bitwidth // 8
+        self.lanes = 8 * LANES // self._bytes
+        self.vector = ir.VectorType(context.get_value_type(number), self.lanes)
+        self.zero = ir.Constant(self.vector, [0.0] * self.lanes)
+        self._mask_type = ir.VectorType(ir.IntType(1), self.lanes)
 
     def shape(self, position: int) -> list[Any]:
         """Extents of an array argument."""
@@ -45,18 +54,20 @@ class Emitter:
 
     def load_vector(self, pointer: Any) -> Any:
         """Load a vector from an address."""
-        return self.builder.load(self.builder.bitcast(pointer, VECTOR.as_pointer()), align=8)
+        place = self.builder.bitcast(pointer, self.vector.as_pointer())
+        return self.builder.load(place, align=self._bytes)
 
     def store_vector(self, value: Any, pointer: Any) -> None:
         """Store a vector at an address."""
-        self.builder.store(value, self.builder.bitcast(pointer, VECTOR.as_pointer()), align=8)
+        place = self.builder.bitcast(pointer, self.vector.as_pointer())
+        self.builder.store(value, place, align=self._bytes)
 
     def spread(self, scalar: Any) -> Any:
         """Broadcast a number to a vector."""
-        vector_type = ir.VectorType(scalar.type, LANES)
+        vector_type = ir.VectorType(scalar.type, self.lanes)
         undefined, zeros = (
             ir.Constant(vector_type, ir.Undefined),
-            ir.Constant(ir.VectorType(_INT32, LANES), None),
+            ir.Constant(ir.VectorType(_INT32, self.lanes), None),
         )
         first = self.builder.insert_element(undefined, scalar, _INT32(0))
         return self.builder.shuffle_vector(first, undefined, zeros)
@@ -85,9 +96,9 @@ class Emitter:
 
     def for_strips(self, begin: Any, end: Any, body: Callable[[Any, int], None]) -> None:
         """Emit a loop over columns: body(first column, number of vectors), as wide as a tile may be."""
-        vectors = self.builder.sdiv(self.builder.sub(end, begin), self.index(LANES))
+        vectors = self.builder.sdiv(self.builder.sub(end, begin), self.index(self.lanes))
         whole = self.builder.sdiv(vectors, self.index(TILE_VECTORS))
-        width = self.index(TILE_VECTORS * LANES)
+        width = self.index(TILE_VECTORS * self.lanes)
         with cgutils.for_range(self.builder, whole, intp=self.index) as loop:
             body(self.builder.add(begin, self.builder.mul(loop.index, width)), TILE_VECTORS)
         rest = self.builder.srem(vectors, self.index(TILE_VECTORS))
@@ -99,7 +110,7 @@ class Emitter:
     @contextmanager
     def for_vectors(self, end: Any) -> Iterator[Any]:
         """Emit a loop over the vectors of a row; the last may reach beyond the end."""
-        zero, step = self.index(0), self.index(LANES)
+        zero, step = self.index(0), self.index(self.lanes)
         with cgutils.for_range_slice(self.builder, zero, end, step, intp=self.index) as (column, _):
             yield column
 
@@ -135,38 +146,38 @@ class Emitter:
     def masks(self, position: int, column: Any, n_vectors: int) -> list[Any]:
         """Masks of the vectors that begin at a column of an array argument, which may have fewer columns."""
         extent = self.shape(position)[-1]
-        columns = [self.add(column, c * LANES) for c in range(n_vectors)]
+        columns = [self.add(column, c * self.lanes) for c in range(n_vectors)]
         return [self._mask(self.builder.sub(extent, first)) for first in columns]
 
     def load_masked(self, pointer: Any, masks: list[Any]) -> list[Any]:
         """Load the vectors of a tile's row, zeros where their masks are off."""
-        arguments = [VECTOR.as_pointer(), _INT32, ir.VectorType(ir.IntType(1), LANES), VECTOR]
-        load = self._masked_function("load", ir.FunctionType(VECTOR, arguments))
+        arguments = [self.vector.as_pointer(), _INT32, self._mask_type, self.vector]
+        load = self._masked_function("load", ir.FunctionType(self.vector, arguments))
         vectors = []
         for c, mask in enumerate(masks):
-            address = self.builder.bitcast(self._offset(pointer, c), VECTOR.as_pointer())
-            vectors.append(self.builder.call(load, [address, _INT32(8), mask, ZERO]))
+            address = self.builder.bitcast(self._offset(pointer, c), self.vector.as_pointer())
+            vectors.append(self.builder.call(load, [address, _INT32(self._bytes), mask, self.zero]))
         return vectors
 
     def store_masked(self, value: Any, pointer: Any, n_numbers: Any) -> None:
         """Store the first n_numbers of a vector at an address."""
-        arguments = [VECTOR, VECTOR.as_pointer(), _INT32, ir.VectorType(ir.IntType(1), LANES)]
+        arguments = [self.vector, self.vector.as_pointer(), _INT32, self._mask_type]
         store = self._masked_function("store", ir.FunctionType(ir.VoidType(), arguments))
-        address = self.builder.bitcast(pointer, VECTOR.as_pointer())
-        self.builder.call(store, [value, address, _INT32(8), self._mask(n_numbers)])
+        address = self.builder.bitcast(pointer, self.vector.as_pointer())
+        self.builder.call(store, [value, address, _INT32(self._bytes), self._mask(n_numbers)])
 
     def _mask(self, n_numbers: Any) -> Any:
         """Mask of the lanes below a number."""
-        lanes = ir.Constant(ir.VectorType(self.index, LANES), list(range(LANES)))
+        lanes = ir.Constant(ir.VectorType(self.index, self.lanes), list(range(self.lanes)))
         return self.builder.icmp_signed("<", lanes, self.spread(n_numbers))
 
     def _masked_function(self, name: str, function_type: Any) -> Any:
         """LLVM's masked load or store of a vector."""
-        name = f"llvm.masked.{name}.v{LANES}f64.p0"
+        name = f"llvm.masked.{name}.v{self.lanes}f{8 * self._bytes}.p0"
         return cgutils.get_or_insert_function(self.builder.module, function_type, name)
 
     def _offset(self, pointer: Any, n_vectors: int) -> Any:
-        return self.builder.gep(pointer, [self.index(n_vectors * LANES)])
+        return self.builder.gep(pointer, [self.index(n_vectors * self.lanes)])
 
     def _array(self, position: int) -> Any:
         return self.context.make_array(self._types[position])(

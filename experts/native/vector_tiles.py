@@ -16,7 +16,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from experts.native.vector_code import LANES, TILE_ROWS, ZERO, Emitter
+from experts.native.vector_code import TILE_ROWS, Emitter
 
 
 def _emit_sum_product_rows(
@@ -68,6 +68,33 @@ def _emit_sum_product_rows(
     return signature, generate
 
 
+def _emit_layer_rows(typing_context: Any, target: Any, i: Any, start: Any, left: Any, right: Any) -> Any:
+    """Emit ``target[i:i+TILE_ROWS] = start + left[i:i+TILE_ROWS] right``, as far as there are such rows."""
+    signature = types.void(target, types.intp, start, left, right)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        emit = Emitter(context, builder, signature, arguments)
+        i, (n_rows, n_columns), (depth, _) = arguments[1], emit.shape(0), emit.shape(4)
+        rows = [emit.smaller(emit.add(i, r), emit.add(n_rows, -1)) for r in range(TILE_ROWS)]
+
+        def tile(j: Any, n_vectors: int) -> None:
+            sums = emit.accumulate(
+                [emit.load_row(emit.entry(2, j), n_vectors) for _ in rows],
+                +1,
+                emit.index(0),
+                depth,
+                lambda step: [emit.number(3, row, step) for row in rows],
+                lambda step: emit.entry(4, step, j),
+            )
+            for row, values in zip(rows, sums, strict=True):
+                emit.store_row(values, emit.entry(0, row, j))
+
+        emit.for_strips(emit.index(0), n_columns, tile)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
 def _emit_symmetric_product_rows(typing_context: Any, target: Any, i: Any, upper: Any, right: Any) -> Any:
     """Emit ``target[i:i+TILE_ROWS] = symmetric[i:i+TILE_ROWS] right``, as far as there are such rows.
 
@@ -84,7 +111,7 @@ def _emit_symmetric_product_rows(typing_context: Any, target: Any, i: Any, upper
 
         def tile(j: Any, n_vectors: int) -> None:
             sums = emit.accumulate(
-                [[ZERO] * n_vectors for _ in rows],
+                [[emit.zero] * n_vectors for _ in rows],
                 +1,
                 emit.index(0),
                 i,
@@ -211,7 +238,7 @@ def _emit_factorize_rows(
                     fulfilled = builder.fcmp_ordered(relation, pivot, bound)
                     builder.store(builder.and_(builder.load(sound), fulfilled), sound)
 
-        emit.for_strips(builder.sub(i, builder.srem(i, emit.index(LANES))), emit.shape(0)[1], tile)
+        emit.for_strips(builder.sub(i, builder.srem(i, emit.index(emit.lanes))), emit.shape(0)[1], tile)
         return builder.load(sound)
 
     return signature, generate
@@ -341,6 +368,7 @@ def _emit_set_row_sum(
 
 # Untyped, so that calls are not checked against the functions that emit the code.
 sum_product_rows: Any = intrinsic(_emit_sum_product_rows)
+layer_rows: Any = intrinsic(_emit_layer_rows)
 symmetric_product_rows: Any = intrinsic(_emit_symmetric_product_rows)
 factorize_rows: Any = intrinsic(_emit_factorize_rows)
 substitute_rows: Any = intrinsic(_emit_substitute_rows)

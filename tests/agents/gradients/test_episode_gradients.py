@@ -28,12 +28,13 @@ COUNT, DECISIONS, HIDDEN, SEEDS = 16, 30, 12, list(range(16))
 class Flown:
     """Episodes of a small scene, flown by a random network."""
 
-    def __init__(self, scene, decisions=DECISIONS, outputs=3.0, *, noisy=False):
+    def __init__(self, scene, decisions=DECISIONS, outputs=3.0, *, noisy=False, dtype=np.float32):
         environment = DQSpaceArmVectorEnv(COUNT, scene)
         seen = environment.reset(seed=SEEDS)[0]
         self.states, n_u = environment.states, environment.kernels.n_u
         rng = np.random.default_rng(0)
-        self.weights = random_weights([seen.shape[1], HIDDEN, HIDDEN, n_u], rng)
+        weights = random_weights([seen.shape[1], HIDDEN, HIDDEN, n_u], rng)
+        self.weights = [each.astype(dtype) for each in weights]
         self.weights[-2] *= np.float32(outputs)
         self.mean, deviation = seen.mean(axis=0), seen.std(axis=0)
         self.scale = np.where(deviation > 1e-6, 1.0 / np.maximum(deviation, 1e-6), 0.0)
@@ -43,11 +44,6 @@ class Flown:
         if (kernels := environment.kernels).n_p:
             along = Starts.of(kernels, self.states, environment.parameters, times)
             self.episodes.parameters[:] = along.at(np.arange(COUNT))
-
-    def in_double_precision(self):
-        layers = self.episodes._layers
-        for arrays in (self.weights, layers.values, layers._cotangents):
-            arrays[:] = [each.astype(np.float64) for each in arrays]
 
     def meet(self, mismatch):
         rng, times = np.random.default_rng(2), self.episodes._times
@@ -89,8 +85,7 @@ def with_phases(scene):
 def test_gradients_agree_with_differences(small_scene, monkeypatch, case):
     monkeypatch.setattr(episodes, "STEEP", math.inf)  # which shortens slopes
     monkeypatch.setattr(episodes, "ROUGH", 0.0)
-    flown = Flown(with_phases(small_scene) if "phases" in case else small_scene)
-    flown.in_double_precision()
+    flown = Flown(with_phases(small_scene) if "phases" in case else small_scene, dtype=np.float64)
     if "disturbed" in case:
         flown.meet(MISMATCH)
     if case == "substeps":
@@ -112,8 +107,7 @@ def test_gradients_agree_with_differences(small_scene, monkeypatch, case):
 
 @pytest.mark.parametrize("phases", [False, True])
 def test_slopes_have_those_of_roughness(small_scene, phases):
-    flown = Flown(with_phases(small_scene) if phases else small_scene)
-    flown.in_double_precision()
+    flown = Flown(with_phases(small_scene) if phases else small_scene, dtype=np.float64)
     found = {}
     for rough in (0.0, 1e3):  # large beside the cost
         flown.episodes.roughness = rough
@@ -123,7 +117,7 @@ def test_slopes_have_those_of_roughness(small_scene, phases):
 
     def roughness():
         flown.costs()
-        outputs = 0.05 * flown.episodes._layers.values[-1]
+        outputs = 0.05 * flown.episodes._layers.outputs
         parts = np.split(outputs, firsts[1:])
         squares = sum((np.diff(part, n=2, axis=0) ** 2).sum() for part in parts)
         return 1e3 * np.median(costs) * squares / (DECISIONS * COUNT)
@@ -173,8 +167,7 @@ def penalty(t, slope_at_zero):
 def test_slopes_have_those_of_penalties(limited, monkeypatch):
     monkeypatch.setattr(episodes, "STEEP_PENALTIES", math.inf)
     monkeypatch.setattr(episodes, "ROUGH", 0.0)
-    flown = Flown(limited)
-    flown.in_double_precision()
+    flown = Flown(limited, dtype=np.float64)
     kernels, path, penalties = flown.episodes._kernels, path_rows(limited), flown.episodes.penalties
     success = [row for row in terminal_rows(limited) if row.name.startswith("success")]
     assert terminal_rows(limited)[-len(success) :] == tuple(success)
@@ -378,8 +371,7 @@ def test_substeps_are_those_of_the_integrator(small_scene):
 def test_errors_are_those_of_the_cost(small_scene, monkeypatch):
     """To first order, the cost changes by them with half as long steps."""
     monkeypatch.setattr(episodes, "STEEP", math.inf)
-    flown = Flown(small_scene, outputs=30.0)
-    flown.in_double_precision()
+    flown = Flown(small_scene, outputs=30.0, dtype=np.float64)
     before = flown.gradient()[1]
     errors = flown.episodes.errors()
     worst = int(errors.argmax())
