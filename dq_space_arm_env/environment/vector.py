@@ -309,25 +309,25 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
                 "reset them with a reset_mask"
             )
         result = self._envs.step(actions, resetting)
+        begun = resetting
         if len(resetting):
             self._begin_anew(resetting, result)
             self._over = _NONE
-        rewards, terminated, final = result.report[0], result.flags[0], None
+        rewards, terminated, final = result.report[0], result.flags[0], dict[str, Any]()
         if np.count_nonzero(terminated):
             (rows,) = terminated.nonzero()
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 rewards, terminated = rewards.copy(), terminated.copy()
                 final = self._final(rows, result)
                 self._begin_anew(rows, result)
+                begun = np.union1d(resetting, rows)
             else:
                 self._over = rows
         self._remember(result.observation)
         self._extend_trails()
-        info = self._info(result, self._all)
-        if final is not None:
-            info |= final | self._drawn(rows)
-        elif len(resetting):
-            info |= self._drawn(resetting)
+        info = self._info(result, self._all) | final
+        if len(begun):
+            info |= self._drawn(begun)
         return result.observation, rewards, terminated, np.zeros(self.num_envs, dtype=np.bool_), info
 
     def perturb(self, increments: ArrayLike) -> None:
@@ -543,10 +543,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         _, success, diverged = result.flags
         whole = mask is self._all
         values: dict[str, Any] = dict(zip(self._names, result.report[1:], strict=True))
-        if self.scene.constraints:  # as Gymnasium nests dictionaries
+        if self.scene.constraints:
             values = grouped(values)
-            inner = values["constraints"]
-            values["constraints"] = inner | {f"_{name}": mask.copy() for name in inner}
+            if inner := values.get("constraints"):  # as Gymnasium nests dictionaries
+                values["constraints"] = inner | {f"_{name}": mask.copy() for name in inner}
         return {
             **values,
             "is_success": success,

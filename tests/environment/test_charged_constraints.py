@@ -55,6 +55,17 @@ def test_costs_are_violations_over_tolerances():
     assert charged > 0.0
 
 
+def test_volumes_that_never_meet_cost_nothing():
+    """Without a row there are no residuals to report."""
+    fixed = {"frame": "base", "radius": 1.0}
+    apart = {"kind": "distance", "name": "apart", "bodies": [fixed], "obstacles": [fixed]}
+    venv, env = (kind(scene=scene(apart, name="planar")) for kind in (DQSpaceArmVectorEnv, DQSpaceArmEnv))
+    (_, info), (_, single) = (each.reset(seed=0) for each in (venv, env))
+    assert info["cost"] == [0.0] == [single["cost"]]
+    assert info.keys() == {*single, *(f"_{name}" for name in single)}
+    assert venv.step(np.zeros((1, 6)))[-1]["cost"] == [0.0]
+
+
 @pytest.mark.sampled
 @pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
 def test_vector_environments_charge_the_same_to_the_bit(mode):

@@ -331,3 +331,20 @@ def test_the_final_info_of_copies_that_go_on_is_zero():
     final = {name: value for name, value in info["final_info"].items() if not name.startswith("_")}
     assert final["cost_pose"][0] > 0.0
     assert not any(np.any(value[1]) for value in final.values())
+
+
+def test_what_two_kinds_of_resets_draw_in_one_step_is_told_of_both():
+    """A copy that was over begins, and another ends and begins."""
+    scene, idle = short("random-target"), np.zeros((2, 12))
+    first, venv = DQSpaceArmVectorEnv(2, scene), DQSpaceArmVectorEnv(2, scene, "SameStep")
+    first.reset(seed=0)
+    first.step(idle)
+    first.reset(options={"reset_mask": np.array([False, True])})
+    for _ in range(scene.simulation.steps - 1):
+        first.step(idle)
+    venv.set_state(first.get_state())
+    *_, info = venv.step(idle)
+    assert info["_final_info"].tolist() == [False, True]
+    assert info["_parameters"].tolist() == [True, True]
+    drawn = [info["parameters"][name] for name in venv.kernels.parameters.names]
+    np.testing.assert_array_equal(np.transpose(drawn), venv.parameters)
