@@ -221,7 +221,9 @@ def _task(scene: Scene) -> Iterator[tuple[str, str]]:
     yield "success", f"within {', '.join(largest[:-1])} and {largest[-1]} at the end"
     for constraint in scene.constraints:
         rows = len(path_rows(scene.model_copy(update={"constraints": (constraint,)})))
-        what = f", {rows} row{'s' * (rows > 1)} along the path" if rows else ", at the end"
+        what = f", {rows} row{'s' * (rows > 1)} along the path"
+        if not rows:
+            what = ", at the end" if constraint.kind == "terminal" else ", no row: its volumes never meet"
         yield "constraint", f"{constraint.name}: {constraint.kind.replace('_', ' ')}{what}"
 
 

@@ -70,6 +70,17 @@ def test_show_has_phases(capsys: pytest.CaptureFixture[str]) -> None:
     assert ["cost.pose:", "50", "0.01", "m"] in shown
 
 
+def test_show_says_what_a_constraint_asks_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fixed, file = {"frame": "base", "radius": 1.0}, tmp_path / "constrained.yaml"
+    apart = {"name": "apart", "kind": "distance", "bodies": [fixed], "obstacles": [fixed]}
+    exact = {"name": "exact", "kind": "terminal", "exact": ["pose"]}
+    load_scene("planar").replace(constraints=[apart, exact]).to_yaml(file)
+    assert main(["scenes", "show", str(file)]) == SUCCESS
+    output = capsys.readouterr().out
+    assert "apart: distance, no row: its volumes never meet" in output
+    assert "exact: terminal, at the end" in output
+
+
 def test_show_says_that_thrusters_only_push(capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("thrusters", "planar"):
         assert main(["scenes", "show", name]) == SUCCESS
