@@ -4,7 +4,7 @@ Those are the numbers that its spread draws for each episode, and those that it 
 Whatever varies is known by its path in the scene: "links.0.mass", "base.inertia.xx", "target.pose.q_r0".
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, freedoms
@@ -116,8 +116,18 @@ def numbers(scene: Scene) -> Iterator[Number]:
         yield _number(PHASE, "1", 0.0)
         yield from catch_numbers(scene)
     controls = [each for numbers in control_numbers(scene).values() for each in numbers]
-    yield from dict.fromkeys(control.weight for control in controls)
-    yield from dict.fromkeys(control.limit for control in controls)
+    yield from _shared(control.weight for control in controls)
+    yield from _shared(control.limit for control in controls)
+
+
+def _shared(found: Iterable[Number]) -> Iterable[Number]:
+    """Each number once by its name: motors of which some turn and others slide share theirs, in two units."""
+    each: dict[str, Number] = {}
+    for number in found:
+        known = each.setdefault(number.name, number)
+        if number.unit not in known.unit.split(" or "):
+            each[number.name] = known._replace(unit=f"{known.unit} or {number.unit}")
+    return each.values()
 
 
 def _motor_numbers(place: str, link: Link) -> Iterator[Number]:
