@@ -32,10 +32,11 @@ def fill_stages(kernels: KernelLibrary, rows: NDArray[Any]) -> None:
     for name, each in values.items():
         for begin, end, value in zip(starts, ends, each, strict=True):
             rows[begin:end, entries.names.index(name)] = value
-    for begin, end, pose, caught in zip(starts, ends, resting, catches, strict=True):
-        if caught:
-            twist = velocity[begin][list(velocity_entries(scene))]
-            rows[begin - 1, entries.indices(CATCH)] = [1.0, *twist]
+    before = (None, *resting[:-1])
+    for begin, end, pose, rested, caught in zip(starts, ends, resting, before, catches, strict=True):
+        if caught:  # from where the target is in the phase before
+            twist = velocity[begin] if rested is None else np.zeros(6)
+            rows[begin - 1, entries.indices(CATCH)] = [1.0, *twist[list(velocity_entries(scene))]]
         if moving and pose is not None:
             still = [*(pose[i] for i in target_entries(scene)), *[0.0] * len(velocity_entries(scene))]
             rows[begin:end, moving] = still

@@ -87,6 +87,21 @@ def test_motors_that_turn_and_motors_that_slide_share_a_weight_that_phases_chang
         assert env.step(action)[-1]["cost_control"] == pytest.approx(effort, rel=1e-12)
 
 
+def test_a_body_that_came_to_rest_is_caught_at_rest() -> None:
+    rest = {"target.motion": None, "target.pose.position": [1.7, -0.5, 0.9]}
+    scene = SCENES["capture-and-detumble"].replace(
+        phases=[
+            {"name": "tumble", "steps": 1, "changes": {"payload": None}},
+            {"name": "rest", "steps": 1, "changes": {"payload": None, **rest}},
+            {"name": "hold", "steps": 1, "catch": ANYWAY, "changes": rest},
+        ],
+        simulation={"steps": 3},
+    )
+    kernels = compile_scene(scene)
+    caught = kernels.stage_parameters()[1, kernels.parameters.indices("catch")]
+    assert caught.tolist() == [1.0, *[0.0] * 6]
+
+
 def test_recorded_controls_are_fractions_of_the_limits_of_their_phase() -> None:
     scene = SCENES["release"]
     problem = ArmProblem(scene)
