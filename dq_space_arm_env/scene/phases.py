@@ -57,6 +57,8 @@ def _flat(items: Iterable[tuple[Any, Any]], prefix: str = "") -> Iterable[tuple[
 
 
 def _plain(path: str, value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, list | tuple):
         return tuple(_plain(path, entry) for entry in value)
     if value is None or isinstance(value, bool | int | float | str):

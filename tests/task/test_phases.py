@@ -483,6 +483,13 @@ def test_scenes_with_phases_survive_their_yaml() -> None:
         assert again.content_hash() == scene.content_hash()
 
 
+def test_phases_take_numbers_of_numpy() -> None:
+    changes = {"base.mass": np.float64(97.0), "base.inertia": np.array([9.7, 9.7, 8.64])}
+    scene = SCENES["refuelling"].replace({"phases.2.changes": changes})
+    assert scene.phases[2].changes == (("base.inertia", (9.7, 9.7, 8.64)), ("base.mass", 97.0))
+    assert "base.mass: 97.0" in scene.to_yaml()
+
+
 def test_an_entry_of_an_inertia_may_change() -> None:
     changed = SCENES["release"].replace({"phases.1.changes.base.inertia.0.0": 11.0})
     assert changed.staged.values["base.inertia.xx"][1] == 11.0
