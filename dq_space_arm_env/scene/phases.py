@@ -196,6 +196,8 @@ def phase_problems(scene: Scene) -> Iterator[Problem]:
             else:
                 what = f"{unlike[0]}: give it a number other than 0, however small"
             yield Problem(here, dict(phase.changes), f"adds or removes {what}")
+        if rests and index == 0:
+            yield Problem(here, dict(phase.changes), "stops the target before it moves: remove target.motion")
         if not rests and not moves:
             yield Problem(
                 here, dict(phase.changes), "moves a target that came to rest: keep target.motion null"

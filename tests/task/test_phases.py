@@ -447,6 +447,10 @@ def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
         ),
         ({"phases.0.changes": {"payload": None, "target.motion": None}}, "keep target.motion null"),
         (
+            {f"phases.{i}.changes": {"payload": None, "target.motion": None} for i in range(2)},
+            "stops the target before it moves: remove target.motion",
+        ),
+        (
             {"phases.0.changes": {"payload": None, "target.pose.position": [1, 2, 3]}},
             "needs target.motion: null",
         ),
