@@ -77,7 +77,8 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
     | `"sparse"`    | 0 if the tip is within the scene's tolerances of the goal after the step (3 deg and 0.1 m), else -1           |
     | `"dense"`     | -(q_{G/I} - q_{D/I})' W (q_{G/I} - q_{D/I}) after the step, weight 15: the paper's pose cost, the smaller over both signs |
 
-    With the scene's `cost.pose_error: relative` the dense reward squares q_{D/G} - 1, likewise.
+    With the scene's `cost.pose_error: relative` the dense reward squares q_{D/G} - 1, likewise. Its weights are the scene's at all times: goals alone do not tell
+    what phases or parameters make of them.
 
     `compute_reward(achieved_goal, desired_goal, info)` returns the reward for other goals, single ones (8,) or batches (B, 8); for those of a step and its `info` it
     returns the reward of that step, bit for bit. Effort is not part of the reward, as it could not be computed from goals.
