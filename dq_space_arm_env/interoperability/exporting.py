@@ -131,6 +131,16 @@ def joint_limits(scene: Scene) -> list[tuple[float, float, float]]:
     return [(lower, upper, rate) for lower, upper, rate in limits]
 
 
+def depth_first(scene: Scene) -> list[int]:
+    """Links in the order of other programs' coordinates: each right before what it carries."""
+
+    def carried_by(body: int) -> list[int]:
+        links = [link for link, parent in enumerate(scene.parent_bodies) if parent == body]
+        return [each for link in links for each in (link, *carried_by(link + 1))]
+
+    return carried_by(0)
+
+
 def tip_on_its_body(scene: Scene) -> tuple[float, ...]:
     """Pose of the tip in the frame of the body that carries it, with the wrist at its initial angles."""
     if scene.wrist is None:

@@ -15,6 +15,7 @@ import numpy as np
 from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.interoperability import mjcf_looks as looks
 from dq_space_arm_env.interoperability.exporting import (
+    depth_first,
     free_name,
     joint_limits,
     refuse,
@@ -203,16 +204,6 @@ def _add_actuators(root: Element, scene: Scene) -> None:
             motor.set("ctrlrange", words([layout.lower_limits(layout.control_limit)[index], limit]))
 
 
-def _depth_first(scene: Scene) -> list[int]:
-    """Links in the order of MuJoCo's coordinates: each right before what it carries."""
-
-    def carried_by(body: int) -> list[int]:
-        links = [link for link, parent in enumerate(scene.parent_bodies) if parent == body]
-        return [each for link in links for each in (link, *carried_by(link + 1))]
-
-    return carried_by(0)
-
-
 def _add_start(root: Element, scene: Scene) -> None:
     start, layout = scene.initial_state, StateLayout.of(scene)
     parts = (layout.state.joint_angles, layout.state.joint_rates)
@@ -221,7 +212,7 @@ def _add_start(root: Element, scene: Scene) -> None:
         ([*islice(angles, link.freedoms + link.is_spherical)], [*islice(rates, link.freedoms)])
         for link in scene.links
     ]
-    order = [joints[link] for link in _depth_first(scene)]
+    order = [joints[link] for link in depth_first(scene)]
     rotation, position = poses.to_rotation_and_position(start.base_pose.dual_quaternion)
     angular, linear = start.base_velocity[:3], rotations.rotate(rotation, start.base_velocity[3:])
     if scene.base.motion == "planar":

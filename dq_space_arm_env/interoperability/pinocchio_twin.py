@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import import_module
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,12 @@ from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
-from dq_space_arm_env.interoperability.exporting import changed_robots, coupled_rotors, tip_on_its_body
+from dq_space_arm_env.interoperability.exporting import (
+    changed_robots,
+    coupled_rotors,
+    depth_first,
+    tip_on_its_body,
+)
 from dq_space_arm_env.scene import Scene, SceneError, StateLayout, load_scene
 from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.pose import PLANAR_POSE
@@ -30,10 +37,11 @@ def pinocchio_model(scene: Scene | str | Path) -> Any:
 
     Joint `base` is a free flyer (planar scenes: a planar joint) with the frame e0, at the center of mass;
     each link has a joint about or along z, called by its name, or a spherical one; a link that is fixed is
-    part of what carries it. There is no gravity; limits are not set. Rotors are its `armature`. Frame `tip`
-    is G, with the wrist at its initial angles. `to_pinocchio` and `generalized_forces` give the arguments of
-    Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)` is (dv, dw, joint accelerations), where
-    (dw, dv) are the scene's base accelerations.
+    part of what carries it. Where arms branch, one arm follows the other, as Pinocchio's algorithms need it,
+    also where the scene has its links in another order. There is no gravity; limits are not set. Rotors are
+    its `armature`. Frame `tip` is G, with the wrist at its initial angles. `to_pinocchio` and
+    `generalized_forces` give the arguments of Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)`
+    is (dv, dw, joint accelerations), where (dw, dv) are the scene's base accelerations.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file; its nominal
@@ -57,17 +65,18 @@ def pinocchio_model(scene: Scene | str | Path) -> Any:
     model.name = scene.name
     model.gravity = pin.Motion.Zero()
     free = pin.JointModelPlanar() if tree.planar else pin.JointModelFreeFlyer()
-    joints = [model.addJoint(0, free, pin.SE3.Identity(), "base")]
+    joints = [model.addJoint(0, free, pin.SE3.Identity(), "base")] * (1 + len(tree.links))
     model.appendBodyToJoint(joints[0], _inertia(pin, tree.base), pin.SE3.Identity())
-    for link, (index, _) in zip(tree.links, freedoms(scene.links), strict=True):
-        parent = joints[link.parent]
-        if link.spherical:  # Pinocchio has one joint for all three
-            joints.append(parent)
-        else:
+    moving = freedoms(scene.links)
+    for number in _places(scene)[1]:
+        link, (index, _) = tree.links[number], moving[number]
+        joint = joints[link.parent]
+        if not link.spherical:  # Pinocchio has one joint for all three
             kind = pin.JointModelSpherical() if link.spherical == 0 else _joint(pin, link.screw)
-            joints.append(model.addJoint(parent, kind, _placement(pin, link.joint), scene.links[index].name))
+            joint = model.addJoint(joint, kind, _placement(pin, link.joint), scene.links[index].name)
+        joints[number + 1] = joint
         if link.body.mass:
-            model.appendBodyToJoint(joints[-1], _inertia(pin, link.body), pin.SE3.Identity())
+            model.appendBodyToJoint(joint, _inertia(pin, link.body), pin.SE3.Identity())
     if any(link.rotor is not None for link in tree.links):
         armature = np.zeros(model.nv)
         for joint, link in zip(joints[1:], tree.links, strict=True):
@@ -81,6 +90,17 @@ def pinocchio_model(scene: Scene | str | Path) -> Any:
         tip = _placement(pin, place) * tip
     model.addFrame(pin.Frame("tip", joints[tree.tip_body], tip, pin.FrameType.OP_FRAME))
     return model
+
+
+def _places(scene: Scene) -> tuple[list[int], list[int]]:
+    """Where Pinocchio's coordinates and velocities of joints are among a state's joint angles and rates."""
+
+    def places(sizes: Sequence[int]) -> list[int]:
+        ends = [*accumulate(sizes)]
+        return [place for link in depth_first(scene) for place in range(ends[link] - sizes[link], ends[link])]
+
+    links = scene.links
+    return places([len(link.coordinates) for link in links]), places([link.freedoms for link in links])
 
 
 def _joint(pin: Any, screw: Screw) -> Any:
@@ -97,11 +117,11 @@ def to_pinocchio(scene: Scene | str | Path, x: ArrayLike) -> tuple[Array, Array]
         x: State, shape (n_x,), units of the state; the wrist's angles are not part of the model.
 
     Returns:
-        q: position of e0 in inertial axes, m, quaternion with the scalar last, joint angles, rad, or
-        quaternions likewise, shape (7 + n,), 1 more for each spherical joint (planar: x, y, cosine and sine
-        of the angle, joint angles, (4 + n,)); v: linear velocity of
-        e0, m/s, angular velocity, rad/s, both in base axes, joint rates, rad/s, shape (6 + n,) (planar:
-        v_x, v_y, omega_z, joint rates, (3 + n,)).
+        q: position of e0 in inertial axes, m, quaternion with the scalar last, joint angles in the order of
+        the model, rad, or quaternions likewise, shape (7 + n,), 1 more for each spherical joint (planar: x,
+        y, cosine and sine of the angle, joint angles, (4 + n,)); v: linear velocity of e0, m/s, angular
+        velocity, rad/s, both in base axes, joint rates, rad/s, shape (6 + n,) (planar: v_x, v_y, omega_z,
+        joint rates, (3 + n,)).
 
     Raises:
         TypeError: If x is masked, or not of real numbers.
@@ -121,7 +141,9 @@ def to_pinocchio(scene: Scene | str | Path, x: ArrayLike) -> tuple[Array, Array]
     values = values.copy()
     for where in unit_quaternions(scene):
         values[where] = np.roll(values[where], -1)
-    return np.array([*base, *values[entries.joint_angles]]), np.array([*velocity, *motion.joint_rates])
+    angles, rates = _places(scene)
+    joints = values[entries.joint_angles][angles]
+    return np.array([*base, *joints]), np.array([*velocity, *(motion.joint_rates[place] for place in rates)])
 
 
 def from_pinocchio(
@@ -160,6 +182,8 @@ def from_pinocchio(
         position, (i, j, k, w), angles = configuration[:3], configuration[3:7], configuration[7:]
         base = list(poses.from_rotation_and_position((w, i, j, k), tuple(position)))
         twist, rates = [*velocity[3:6], *velocity[:3]], velocity[6:]
+    ours = _places(scene)
+    angles, rates = angles[np.argsort(ours[0])], rates[np.argsort(ours[1])]
     previous = np.zeros(layout.n_x - layout.state.joint_rates.stop)
     x = np.array([*base, *angles, *wrist, *twist, *rates, *previous], dtype=np.float64)
     for part in (configuration[2:4] if planar else configuration[3:7], *(x[where] for where in quaternions)):
@@ -180,8 +204,8 @@ def generalized_forces(scene: Scene | str | Path, x: ArrayLike, u: ArrayLike) ->
             not the commands; the wrist's rates do no work.
 
     Returns:
-        Force at e0, N, torque, N m, both in base axes, joint torques, N m, shape (6 + n,) (planar: f_x, f_y,
-        tau_z, joint torques, (3 + n,)).
+        Force at e0, N, torque, N m, both in base axes, joint torques in the order of the model, N m, shape
+        (6 + n,) (planar: f_x, f_y, tau_z, joint torques, (3 + n,)).
 
     Raises:
         TypeError: If x or u is masked, or not of real numbers.
@@ -199,8 +223,8 @@ def generalized_forces(scene: Scene | str | Path, x: ArrayLike, u: ArrayLike) ->
     base += map(sum, zip(inputs.torque, tip.torque, strict=True))
     if equations.tree.planar:
         base = [*base[:2], base[5]]
-    joints = map(sum, zip(inputs.joint_torques, passive, tip.joints, strict=True))
-    return np.array([*base, *joints], dtype=np.float64)
+    joints = [*map(sum, zip(inputs.joint_torques, passive, tip.joints, strict=True))]
+    return np.array([*base, *(joints[place] for place in _places(scene)[1])], dtype=np.float64)
 
 
 def _pinocchio() -> Any:

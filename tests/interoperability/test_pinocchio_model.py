@@ -8,6 +8,7 @@ from foreign_robots import accelerations, drawn, relative_error, tip_pose
 
 from dq_space_arm_env import from_pinocchio, generalized_forces, load_scene, pinocchio_model, to_pinocchio
 from dq_space_arm_env.scene import SceneError, StateLayout
+from dq_space_arm_env.scene.start import unit_quaternions
 
 pin = pytest.importorskip("pinocchio")
 
@@ -41,6 +42,40 @@ def test_accelerations_and_tip_are_the_same(name, change):
         placement, (rotation, position) = data.oMf[model.getFrameId("tip")], tip_pose(scene, x)
         np.testing.assert_allclose(placement.rotation, rotation, rtol=0, atol=1e-13)
         np.testing.assert_allclose(placement.translation, position, rtol=0, atol=1e-13)
+
+
+def branched():
+    """A scene whose first link carries a ball, after the arm, and its second a slide."""
+    scene = load_scene("no-wrist")
+    links = [link.model_dump() for link in scene.links]
+    more = {"mass": 2.0, "inertia": [0.1, 0.2, 0.25], "center_of_mass": [0.1, 0.2, 0.3]}
+    slide = {"name": "slide", "parent": links[1]["name"], "joint_type": "prismatic", "damping": 0.3}
+    ball = {"name": "ball", "parent": links[0]["name"], "joint_type": "spherical", "actuated": False}
+    place = {"joint": {"position": [0.3, -0.2, 0.1], "rotation": {"axis": [1, 2, 3], "angle": 50}}}
+    links += [{**ball, **more, **place}, {**slide, **more, **place}]
+    start = {"joint_angles": [0.0] * 7, "joint_rates": [0.0] * 7}
+    simulation = {"integrator": "rk4"}
+    return scene.replace(links=links, tip_link=links[2]["name"], initial_state=start, simulation=simulation)
+
+
+def test_where_arms_branch_every_algorithm_has_its_order():
+    """Composite inertias are sums over joints in a row, which those that a joint carries must be."""
+    scene, rng = branched(), np.random.default_rng(1)
+    model = pinocchio_model(scene)
+    data = model.createData()
+    x, u = drawn(scene, rng)
+    for where in unit_quaternions(scene):
+        x[where] /= np.linalg.norm(x[where])
+    q, v = to_pinocchio(scene, x)
+    np.testing.assert_allclose(from_pinocchio(scene, q, v), x, rtol=0, atol=1e-14)
+    mass = np.triu(pin.crba(model, data, q))
+    mass += np.triu(mass, 1).T
+    at_rest = np.zeros(model.nv)
+    columns = [pin.rnea(model, data, q, at_rest, unit) for unit in np.eye(model.nv)]
+    np.testing.assert_allclose(mass, np.array(columns).T, rtol=0, atol=1e-10)
+    a = pin.aba(model, data, q, v, generalized_forces(scene, x, u))
+    first, second, third, *ball, slide = accelerations(scene, x, u)[6:]
+    np.testing.assert_allclose(a[6:], [first, second, third, slide, *ball], rtol=1e-11, atol=0)
 
 
 @pytest.mark.parametrize("name", SCENES)
