@@ -164,9 +164,10 @@ class UrdfTree:
         for name in locked:
             known = [joint for joint in self.robot.joints if self.robot.joints[joint] not in chain]
             if name not in known:
+                there = f"these are {_some(known)}" if known else "there is none"
                 raise SceneError(
                     f"lock_branches: {name!r} is not a joint beside the way from base to tip; "
-                    f"{did_you_mean(name, known)}{f'these are {_some(known)}' if known else 'there is none'}"
+                    f"{did_you_mean(str(name), known)}{there}"
                 )
         rank = {name: index for index, name in enumerate(self.robot.joints)}
         found: list[UrdfJoint] = []

@@ -116,6 +116,11 @@ def scene_from_urdf(
     arm = arm_of(robot, tip, base, lock_branches, extra, mount, balance_inertias, motorless)
     _check_passive(arm, passive)
     _warn(arm)
+    tip_link = None if arm.way == len(arm.joints) else arm.joints[arm.way - 1].joint.child
+    if tip_link == BASE:
+        raise SceneError(
+            f"URDF: link {BASE!r}, which carries the tip, has the name of a scene's spacecraft: rename it"
+        )
     center = ", ".join(f"{round(float(number), 6) + 0.0:.6g}" for number in arm.base_center)
     frame = f"link {arm.base_link}" if mount == HERE else "the spacecraft"
     fixed = f"link {arm.base_link}" if extra is None else f"spacecraft and link {arm.base_link}"
@@ -125,7 +130,7 @@ def scene_from_urdf(
         f"at ({center}) m in {frame}.",
         "base": {"mass": arm.base.mass, "inertia": tidied(arm.base.inertia).tolist()},
         "links": _links(arm, joint_torque, passive, dampers),
-        "tip_link": None if arm.way == len(arm.joints) else arm.joints[arm.way - 1].joint.child,
+        "tip_link": tip_link,
         "tip": written_pose(arm.tip),
         "actuators": {
             "base_force": None if base_force is None else {"limit": base_force},

@@ -143,6 +143,7 @@ def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
             {"tip": "arm", "lock_branches": ["j1"]},
             "lock_branches: 'j1' is not a joint beside the way from base to tip; there is none$",
         ),
+        ({"tip": "arm", "lock_branches": [1]}, "lock_branches: 1 is not a joint beside the way"),
         ({"tip": "arm", "lock_branches": 1}, "lock_branches = 1: must be a list of names of joints, or True"),
         ({"tip": "arm", "passive": None}, "passive = None: must be a list of names of joints"),
         ({"tip": "arm", "joint_torque": True}, "joint_torque = True: must be a number greater than 0, N m"),
@@ -159,6 +160,14 @@ def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
 def test_wrong_arguments_are_refused(arguments, sentence):
     with pytest.raises(SceneError, match=sentence):
         scene_from_urdf(robot(*GOOD), **arguments)
+
+
+def test_a_tip_on_a_link_called_as_the_spacecraft_is_refused():
+    """In the scene its tip would be on the spacecraft."""
+    parts = link("bus"), joint("j1", "bus", "base"), BASE, joint("j2", "base", "arm"), ARM
+    with pytest.raises(SceneError, match=r"link 'base', which carries the tip, .* rename it"):
+        scene_from_urdf(robot(*parts), "base")
+    assert scene_from_urdf(robot(*parts), "arm").tip_body == 2
 
 
 def test_a_locked_joint_must_not_follow_the_chain():
