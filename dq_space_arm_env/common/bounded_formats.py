@@ -252,7 +252,7 @@ def parse_xml(
     try:
         parser.Parse(content.encode("utf-8") if isinstance(content, str) else content, True)
         return builder.close()
-    except UnreadableError:
-        raise
-    except (expat.ExpatError, LookupError, UnicodeError, AssertionError) as error:
+    except (expat.ExpatError, LookupError, ValueError, AssertionError) as error:
+        if isinstance(error, ValueError) and type(error).__module__ != "builtins":
+            raise  # ours, or that of `check`
         raise UnreadableError(f"{what}: not valid XML: {reason_of(error)}") from error

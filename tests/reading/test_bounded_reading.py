@@ -196,6 +196,7 @@ def test_headers_of_tensors_are_compared_with_the_file(content: bytes, said: str
         ("<a>", "not valid XML"),
         ("<a>\ud800</a>", "not valid XML"),
         (b"<?xml version='1.0' encoding='nonsense'?><a/>", "not valid XML"),
+        (b"<?xml version='1.0' encoding='shift_jis'?><a/>", "multi-byte encodings are not supported"),
     ],
 )
 def test_xml_that_expands(text: str | bytes, said: str) -> None:
