@@ -104,12 +104,25 @@ def serve(parent: int) -> None:
                 function, arguments = pickle.load(tasks)
             except EOFError:
                 return
-            answer, problem = None, None
-            try:
-                answer = function(*arguments)
             except Exception as error:
-                error.add_note("".join(traceback.format_exception(error)))
-                problem = error
-            pickle.dump((answer, problem), answers)
+                answers.write(_sent(error))
+                return  # where the next task begins is not known
+            try:
+                answer = pickle.dumps((function(*arguments), None))
+            except Exception as error:
+                answer = _sent(error)
+            answers.write(answer)
             answers.flush()
-            del function, arguments, answer, problem  # frees their memory before the next ones
+            del function, arguments, answer  # frees their memory before the next ones
+
+
+def _sent(error: Exception) -> bytes:
+    """An error as an answer: itself with its traceback, or its words if it would not arrive."""
+    origin = "".join(traceback.format_exception(error))
+    for sent in (error, RuntimeError(f"{type(error).__name__}: {error}")):
+        sent.add_note(origin)
+        with contextlib.suppress(Exception):
+            answer = pickle.dumps((None, sent))
+            pickle.loads(answer)
+            break
+    return answer

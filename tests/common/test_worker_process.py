@@ -1,0 +1,60 @@
+"""What fails in another process is raised in this one, and no worker seems lost for it."""
+
+import sys
+import threading
+from contextlib import closing
+from types import ModuleType
+
+import pytest
+
+from dq_space_arm_env.common.worker_process import WorkerProcess
+
+
+class TwoWordsError(Exception):
+    """Unpickling calls it with one."""
+
+    def __init__(self, file: str, line: int) -> None:
+        super().__init__(f"{file}:{line}")
+
+
+class HoldingError(ValueError):
+    """It holds what no other process can have."""
+
+    def __init__(self) -> None:
+        super().__init__("held")
+        self.lock = threading.Lock()
+
+
+def two_words() -> None:
+    raise TwoWordsError("a.npz", 3)
+
+
+def holding() -> None:
+    raise HoldingError
+
+
+def test_what_cannot_be_sent_comes_in_words_and_the_worker_goes_on() -> None:
+    with closing(WorkerProcess()) as worker:
+        for function, words in ((two_words, r"^TwoWordsError: a\.npz:3"), (holding, "^HoldingError: held")):
+            worker.assign(function)
+            with pytest.raises(RuntimeError, match=words) as caught:
+                worker.answer()
+            assert any(f"in {function.__name__}" in note for note in caught.value.__notes__)
+        worker.assign(threading.Lock)
+        with pytest.raises(TypeError, match="cannot pickle"):
+            worker.answer()
+        worker.assign(int, "three")
+        with pytest.raises(ValueError, match="'three'"):
+            worker.answer()
+        worker.assign(abs, -3)
+        assert worker.answer() == 3
+
+
+def test_a_function_that_is_here_alone_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("only_here")
+    exec("def work(): pass", module.__dict__)
+    monkeypatch.setitem(sys.modules, "only_here", module)
+    with closing(WorkerProcess()) as worker:
+        worker.assign(module.work)
+        with pytest.raises(ModuleNotFoundError, match="only_here"):
+            worker.answer()
