@@ -239,6 +239,7 @@ def arm_length(scene: Scene) -> float:
         link = scene.links[body - 1]
         length += math.hypot(*link.joint.position)
         if link.joint_type in ("prismatic", "screw"):
-            length += max(abs(bound) for bound in limits[body - 1][:2])  # infinite for no limit
+            slide = 1.0 if link.joint_type == "prismatic" else abs(link.pitch)
+            length += slide * max(abs(bound) for bound in limits[body - 1][:2])  # infinite for no limit
         body = scene.parent_bodies[body - 1]
     return length

@@ -176,6 +176,13 @@ def test_shipped_scenes_come_without_warnings_but_for_light_hands() -> None:
 MANY = {"name": "l", "kind": "joint_limits", "lower": -170, "upper": [170, 0.5, 1]}
 
 
+SCREW = {
+    **{"links.2.joint_type": "screw", "links.2.pitch": 0.01, "actuators.base_force": None},
+    "constraints": [{"name": "l", "kind": "joint_limits", "lower": -6.0, "upper": 6.0}],
+    "target.pose.position": [9, 0, 0],
+}
+
+
 NEAR = {
     "name": "ball",
     "kind": "distance",
@@ -227,6 +234,7 @@ NEAR = {
             {"actuators.base_force": None, "target.pose.position": [9, 0, 0]},
             r"target: [0-9.]+ m from the center of mass, from which the arm reaches 2.96 m: it is out of",
         ),
+        (SCREW, "target: [0-9.]+ m from the center of mass, from which the arm reaches 3.03 m: it is out of"),
         (
             {"target.pose.position": [900, 0, 0]},
             r"target: 90[0-9] m .*, thrusters move it by [0-9.]+ m in 15 s: it is out of reach",
