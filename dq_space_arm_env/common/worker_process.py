@@ -15,7 +15,8 @@ from collections.abc import Callable
 from time import sleep
 from typing import Any
 
-# Ctrl-C is left to the parent. The package is imported from where the parent imported it.
+# Ctrl-C is left to the parent. The package is imported from where the parent imported it, and nothing from
+# the present folder, where a user's `signal.py` is another.
 BEGIN = (
     "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); sys.path[:] = sys.argv[2:]; "
     "from dq_space_arm_env.common.worker_process import serve; serve(int(sys.argv[1]))"
@@ -35,7 +36,7 @@ class WorkerProcess:
     def __init__(self, *, quiet: bool = False) -> None:
         """Start it; a quiet one has no standard error, where libraries complain when they crash."""
         self._process = subprocess.Popen(
-            [sys.executable, "-c", BEGIN, str(os.getpid()), *sys.path],
+            [sys.executable, "-P", "-c", BEGIN, str(os.getpid()), *sys.path],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL if quiet else None,

@@ -3,6 +3,7 @@
 import sys
 import threading
 from contextlib import closing
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -46,6 +47,14 @@ def test_what_cannot_be_sent_comes_in_words_and_the_worker_goes_on() -> None:
         worker.assign(int, "three")
         with pytest.raises(ValueError, match="'three'"):
             worker.answer()
+        worker.assign(abs, -3)
+        assert worker.answer() == 3
+
+
+def test_files_of_the_present_folder_are_no_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "signal.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    with closing(WorkerProcess()) as worker:
         worker.assign(abs, -3)
         assert worker.answer() == 3
 
