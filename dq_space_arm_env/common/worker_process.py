@@ -39,7 +39,7 @@ class WorkerProcess:
             [sys.executable, "-P", "-c", BEGIN, str(os.getpid()), *sys.path],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL if quiet else None,
+            stderr=subprocess.DEVNULL if quiet or not _has_standard_error() else None,
             env={**os.environ, **_ONE_THREAD},
         )
 
@@ -74,6 +74,14 @@ class WorkerProcess:
                 if pipe is not None:
                     pipe.close()
         self._process.wait()
+
+
+def _has_standard_error() -> bool:
+    """Tell whether this process has one, which others inherit."""
+    try:
+        return os.get_inheritable(2)
+    except OSError:
+        return False
 
 
 def become_worker() -> None:

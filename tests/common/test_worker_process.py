@@ -1,5 +1,8 @@
 """What fails in another process is raised in this one, and no worker seems lost for it."""
 
+import os
+import shlex
+import subprocess
 import sys
 import threading
 from contextlib import closing
@@ -57,6 +60,22 @@ def test_files_of_the_present_folder_are_no_modules(tmp_path: Path, monkeypatch:
     with closing(WorkerProcess()) as worker:
         worker.assign(abs, -3)
         assert worker.answer() == 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX shells")
+def test_a_process_without_standard_error_has_workers() -> None:
+    program = (
+        "from dq_space_arm_env.common.worker_process import WorkerProcess\n"
+        "from dq_space_arm_env.command_line.verb_program import _replace_closed_streams\n"
+        "for _ in range(2):\n"
+        "    worker = WorkerProcess()\n"
+        "    worker.assign(abs, -3)\n"
+        "    print(worker.answer())\n"
+        "    worker.close()\n"
+        "    _replace_closed_streams()\n"
+    )
+    command = ["sh", "-c", f"exec {shlex.quote(sys.executable)} -c {shlex.quote(program)} 2>&-"]
+    assert subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout == b"3\n3\n"
 
 
 def test_a_function_that_is_here_alone_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
