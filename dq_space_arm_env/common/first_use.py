@@ -73,12 +73,12 @@ _announced: set[str] = set()
 def compiling(line: Callable[[], str]) -> Iterator[None]:
     """Show what is being compiled, from the second second on: in the run's progress, or on standard error.
 
-    Nothing is shown where that is no terminal.
+    Nothing is shown where that is no terminal, or closed.
 
     Args:
         line: Tells what is compiled, such as "linearize of scene 'paper'".
     """
-    if not (sys.stderr.isatty() and _logger().isEnabledFor(logging.INFO)):
+    if not (sys.stderr and sys.stderr.isatty() and _logger().isEnabledFor(logging.INFO)):
         yield
         return
     _ticker.begin(line)

@@ -49,6 +49,15 @@ def test_who_waits_sees_what_is_compiled_and_for_how_long(terminal: Terminal) ->
     assert terminal.getvalue().endswith("\x1b[2K")  # the line is erased
 
 
+def test_a_process_without_standard_error_compiles_in_silence(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(first_use.sys, "stderr", None)
+    first_use.announce("scene 'paper'")
+    with first_use.compiling(lambda: "step of scene 'paper'"):
+        pass
+
+
 def test_a_short_wait_and_a_file_show_nothing(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_use, "SECONDS_TO_WAIT", 30.0)
     wait(terminal)
