@@ -238,5 +238,15 @@ def _call_back(jax: Any, on_rows: Function, arrays: Any, shapes: Any, dtype: np.
             for result, shape in zip(results, shapes, strict=True)
         )
 
+    def fill(context: Any, buffers: Any, *given: Any) -> None:
+        for buffer, result in zip(buffers, call(*given), strict=True):
+            np.asarray(buffer)[...] = result
+
     wanted = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
-    return jax.pure_callback(call, wanted, *arrays, vmap_method="expand_dims")
+    in_place = import_module("jax.experimental.buffer_callback").buffer_callback
+    # A pure callback waits for another thread of XLA to bring large arrays, on one processor forever.
+    return jax.lax.platform_dependent(
+        *arrays,
+        cpu=in_place(fill, wanted, vmap_method="expand_dims"),
+        default=lambda *given: jax.pure_callback(call, wanted, *given, vmap_method="expand_dims"),
+    )

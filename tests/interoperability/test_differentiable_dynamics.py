@@ -1,6 +1,8 @@
 """Scenes as functions of PyTorch and JAX: against the kernels, chains of steps, and finite differences."""
 
 import os
+import subprocess
+import sys
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -324,6 +326,29 @@ def test_kernels_take_every_integrator(jax):
         np.testing.assert_array_equal(found, kernels.step(states, inputs[0], integrator=name))
         with pytest.raises(ValueError, match=rf"'{name}' repeats calls .* JAX .* integrator='rk8'"):
             jax_dynamics("planar", name)
+
+
+ON_ONE_PROCESSOR = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import jax
+import numpy as np
+from dq_space_arm_env import jax_dynamics
+jax.config.update("jax_enable_x64", True)
+dynamics = jax_dynamics("planar", "symplectic_euler", kernels=True)
+inputs = np.zeros((30, 2048, dynamics.layout.n_u))
+cost = jax.jit(lambda u: dynamics.rollout(np.array(dynamics.layout.initial_state), u + 0.1)[1].sum())
+print(np.isfinite(cost(inputs)))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes choose no processors here")
+def test_kernels_called_on_one_processor_wait_for_no_other(jax):
+    """Where a large array came from another thread, there was none to bring it."""
+    command = [sys.executable, "-c", ON_ONE_PROCESSOR]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout == "True\n"
 
 
 def test_wrong_precision_in_jax_is_named(jax):
