@@ -226,6 +226,8 @@ def test_unusable_flights_are_refused_in_a_sentence(paper, make_flight):
         ([replace(good, target_body=np.ones((61, 8)))], "target_body: .*real part should have length 1"),
         ([replace(good, payload=np.ones((61, 8)))], "payload: .*real part should have length 1"),
         ([replace(good, controls=np.full((60, 12), "x"))], "'expert': controls: should be numbers"),
+        ([replace(good, states=np.ma.masked_array(good.states, True))], "states: should be numbers .*mask"),
+        ([replace(good, controls=good.controls + 0j)], "controls: should be numbers .*type complex128"),
     ):
         with pytest.raises(ValueError, match=sentence):
             prepare(flights, paper)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.scene import Scene, StateLayout
@@ -258,7 +259,7 @@ def _real_part(layout: StateLayout) -> slice:
 
 def _numbers(name: str, value: ArrayLike) -> FloatArray:
     try:
-        return np.array(value, dtype=np.float64)
+        return np.array(real_array("values", value, np.float64))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: should be numbers ({error})") from error
 
