@@ -122,6 +122,21 @@ def test_zero_and_random_inputs(scene_file: str, tmp_path: Path, capsys: pytest.
     assert costs[0] == costs[1] != zero["cost"]
 
 
+def test_a_flight_does_not_replace_what_it_came_from(
+    scene_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "flight.npz"
+    assert main(["simulate", scene_file, "--policy", "zero", "--out", str(file)]) == SUCCESS
+    content = file.read_bytes()
+    other = f"{tmp_path}/../{tmp_path.name}/flight.npz"
+    for given in (["--policy", str(file)], ["--policy", "zero", "--start", other]):
+        assert main(["simulate", scene_file, *given, "--out", str(file)]) == UNUSABLE
+        assert "which it would replace" in " ".join(capsys.readouterr().err.split())
+    assert file.read_bytes() == content
+    assert main(["simulate", scene_file, "--policy", "zero", "--out", scene_file]) == UNUSABLE
+    assert load_scene(scene_file).name
+
+
 def test_commands_to_copy_quote_their_files(
     scene_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
