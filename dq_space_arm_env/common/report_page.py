@@ -207,8 +207,9 @@ class Page:
 
     def markdown(self) -> str:
         """The page as Markdown; each figure is a file of its name beside it."""
-        verdict = f"**{self._verdict()}**" if self.shortcomings else self._verdict()
-        blocks = [f"# {self.title}", *origin_table(self.origin).markdown(), verdict]
+        verdict = one_line(self._verdict())
+        verdict = f"**{verdict}**" if self.shortcomings else verdict
+        blocks = [f"# {one_line(self.title)}", *origin_table(self.origin).markdown(), verdict]
         for section in self.sections:
             blocks += section.markdown()
         return "\n\n".join(block for block in blocks if block) + "\n"

@@ -174,6 +174,9 @@ def test_numbers_make_curves_and_text_makes_bars() -> None:
     assert [bar.get_width() for bar in axes.patches] == [12, 2400, 3]
 
 
-def test_names_from_files_make_no_markup():
+def test_names_from_files_make_no_markup(origin: dict[str, Any]):
+    page = Page("<img src=x>", [Section("a", "", "", shortcomings=["<img> is missing."])], origin)
+    assert page.markdown().startswith("# &lt;img src=x>\n")
+    assert "<img" not in page.markdown()
     lines = "\n".join(TextTable("t", ("name",), (("<img src=x> [a](javascript:b)",),)).markdown())
     assert "&lt;img src=x> [a]\\(javascript:b)" in lines
