@@ -1,9 +1,11 @@
 """A maneuver in the quantities that the paper plots: errors of the tip, inputs by actuator."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
@@ -25,8 +27,8 @@ class ActuatorHistory:
     unit: str
     inputs: tuple[str, ...]
     values: FloatArray  # Inputs, constant over a time step, shape (N, inputs), `unit`
-    limits: FloatArray  # Largest magnitude of each input, shape (inputs,), `unit`
-    least: FloatArray  # Smallest value of each input, zero for thrusters, shape (inputs,), `unit`
+    limits: FloatArray  # Largest magnitude of each input in any step, shape (inputs,), `unit`
+    at_limit: NDArray[np.bool_]  # Whether each input is as large, or small, as it may be, shape (N, inputs)
     weights: FloatArray  # Weight of each squared input in the cost, shape (N, inputs), 1/unit^2
 
     @property
@@ -37,8 +39,7 @@ class ActuatorHistory:
     @property
     def clamped_share(self) -> float:
         """Share of the inputs at a limit over all stages, 0 to 1."""
-        at_limit = (self.values >= _AT_LIMIT * self.limits) | (self.values <= _AT_LIMIT * self.least)
-        return float(np.mean(at_limit))
+        return float(np.mean(self.at_limit))
 
     @property
     def effort(self) -> float:
@@ -106,7 +107,12 @@ class Maneuver:
     def actuators(self) -> tuple[ActuatorHistory, ...]:
         """The scene's actuators in the order of the controls."""
         layout = StateLayout.of(self.scene)
-        weights, histories = _control_weights(self.scene, layout, len(self.controls)), []
+        weights = self._in_steps(layout.control.weights, layout.control_weight)
+        limits = self._in_steps(layout.control.limits, layout.control_limit)
+        limits = np.where(limits > 0.0, limits, layout.control_limit)  # out of work is not at a limit
+        least = layout.lower_limits(limits)
+        at_limit = (self.controls >= _AT_LIMIT * limits) | (self.controls <= _AT_LIMIT * least)
+        histories = []
         for name in CONTROL_UNITS:
             entries = getattr(layout.control, name)
             if entries.start == entries.stop:
@@ -116,8 +122,8 @@ class Maneuver:
                 layout.control.unit(entries),
                 layout.control.names[entries],
                 self.controls[:, entries],
-                layout.control_limit[entries],
-                layout.lower_limits(layout.control_limit)[entries],
+                limits[:, entries].max(axis=0),
+                at_limit[:, entries],
                 weights[:, entries],
             )
             histories.append(history)
@@ -127,12 +133,11 @@ class Maneuver:
         """The actuator of a name in the scene's `actuators`; None if the scene does not have it."""
         return next((actuator for actuator in self.actuators if actuator.name == name), None)
 
-
-def _control_weights(scene: Scene, layout: StateLayout, steps: int) -> FloatArray:
-    """Weights of the squared controls in each of some steps, shape (steps, n_u): phases may change them."""
-    weights, staged = np.tile(layout.control_weight, (steps, 1)), scene.staged
-    phases = np.searchsorted(staged.starts, np.arange(steps), side="right") - 1
-    for column, name in enumerate(layout.control.weights):
-        if name in staged.values:
-            weights[:, column] = np.array(staged.values[name])[phases]
-    return weights
+    def _in_steps(self, names: Sequence[str], values: FloatArray) -> FloatArray:
+        """Numbers of the controls in each step, shape (N, n_u): phases may change them."""
+        found, staged = np.tile(values, (len(self.controls), 1)), self.scene.staged
+        phases = np.searchsorted(staged.starts, np.arange(len(found)), side="right") - 1
+        for column, name in enumerate(names):
+            if name in staged.values:
+                found[:, column] = np.array(staged.values[name])[phases]
+        return found

@@ -117,7 +117,8 @@ def _compile_solver(scene: Scene) -> None:
 
 def replay(scene: Scene, controls: FloatArray) -> Rollout:
     """Play controls, shape (N, n_u), in the environment from the scene's nominal start."""
-    actions = StateLayout.of(scene).to_action(controls)
+    kernels = compile_scene(scene)
+    actions = kernels.layout.to_action(controls, kernels.stage_parameters()[: len(controls)])
     return rollout(StateFeedback(lambda states, step: actions[step, None]), scene)
 
 

@@ -97,6 +97,35 @@ def test_phases_have_weights_and_robots_of_their_own() -> None:
     np.testing.assert_allclose(found, [flown.attitude_error[0], flown.position_error[0]], rtol=0.0, atol=1e-6)
 
 
+def test_a_limit_of_a_phase_is_that_of_its_steps(short_scene: Scene) -> None:
+    """A joint whose torque is limited to 0.1 N m in the first 20 of 60 steps, and to 0.5 N m then."""
+    weak = {"name": "weak", "steps": 20, "changes": {"links.0.torque_limit": 0.1}}
+    scene = short_scene.replace(
+        {"links.0.torque_limit": 0.5, "phases": [weak, {"name": "strong", "steps": 40}]}
+    )
+    layout, controls = StateLayout.of(scene), np.zeros((60, 2))
+    controls[:20, layout.control.joint_torque], controls[20:, layout.control.joint_torque] = 0.1, -0.2
+    flown = replay(scene, controls)
+    kernels = compile_scene(scene)
+    end = kernels.simulate(layout.initial_state, controls, 60, p=kernels.stage_parameters()[:-1])[-1]
+    attitude, position = kernels.tip_errors(end, p=kernels.stage_parameters()[-1])[:2]
+    np.testing.assert_allclose(flown.attitude_error[0], attitude, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(flown.position_error[0], position, rtol=0.0, atol=1e-9)
+    motor = Maneuver(scene, np.tile(layout.initial_state, (61, 1)), controls).actuator("joint_torque")
+    assert motor is not None
+    assert motor.limits.tolist() == [0.5]
+    assert motor.clamped_share == pytest.approx(20 / 60)
+
+
+def test_an_actuator_out_of_work_is_at_no_limit() -> None:
+    scene = load_scene("capture-and-detumble")
+    idle = next(phase for phase in scene.phases if ("actuators.joint_torque", None) in phase.changes)
+    assert 0 < idle.steps < scene.simulation.steps
+    layout, steps = StateLayout.of(scene), scene.simulation.steps
+    still = Maneuver(scene, np.tile(layout.initial_state, (steps + 1, 1)), np.zeros((steps, layout.n_u)))
+    assert [actuator.clamped_share for actuator in still.actuators] == [0.0] * len(still.actuators)
+
+
 def test_absent_actuators_are_left_out(short_run: ManeuverRun) -> None:
     assert [actuator.name for actuator in short_run.maneuver.actuators] == ["base_torque", "joint_torque"]
     assert short_run.maneuver.actuator("base_force") is None
