@@ -17,6 +17,10 @@ class Sampling(NamedTuple):
     seconds: float
 
 
+_MAY_BE_ZERO = ("seed", "compared_starts")
+"""Numbers without which something is measured all the same."""
+
+
 @dataclass(frozen=True)
 class Effort:
     """Workload; the defaults are the standard level."""
@@ -94,6 +98,8 @@ class Effort:
                 changes[name] = _checked(name, value, old)
                 continue
             items = value if isinstance(value, list) else [value]
+            if not items and getattr(Effort, name):
+                raise ValueError(f"setting {name}: {value!r}, must have an entry, or nothing is measured")
             if isinstance(old, Sampling) and len(items) != len(old):
                 raise ValueError(f"setting {name}: {value!r} must be {len(old)} numbers")
             # A list has entries of one kind: names where the default is empty.
@@ -110,6 +116,8 @@ def _checked(name: str, value: Any, like: Any) -> Any:
         raise ValueError(f"setting {name}: {value!r} must be of type {type(like).__name__}")
     if isinstance(value, int | float) and not 0 <= value < math.inf:
         raise ValueError(f"setting {name}: {value}, must be finite and not negative")
+    if value == 0 and not isinstance(value, bool) and name not in _MAY_BE_ZERO:
+        raise ValueError(f"setting {name}: {value}, must be more than 0, or nothing is measured")
     return value
 
 

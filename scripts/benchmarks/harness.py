@@ -191,11 +191,13 @@ def collect(benchmark: Benchmark, effort: Effort, console: Console) -> tuple[lis
             if not rows:
                 raise  # nothing is lost: unusable input, a missing package
             console.print_exception()
-            sentence = f"ended by {type(error).__name__}: {error}"
-            rows.append(
-                claim("run", "to the end", benchmark.name, None, None, note=sentence, status=Status.FAILED)
-            )
-    return rows, False
+            rows.append(_failure(benchmark, f"ended by {type(error).__name__}: {error}"))
+    return rows or [_failure(benchmark, "nothing was measured: no case fits the settings")], False
+
+
+def _failure(benchmark: Benchmark, sentence: str) -> Row:
+    """A claim that a run has not met."""
+    return claim("run", "to the end", benchmark.name, None, None, note=sentence, status=Status.FAILED)
 
 
 def run(benchmarks: Sequence[Benchmark], effort: Effort, folder: Path, console: Console) -> int:

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,7 @@ def test_a_section_has_a_table_for_each_value_and_sentences_once() -> None:
         ([*ROWS, claim("g", "bad", "s", 2.0, 1.0)], None, FAILURE),
         (ROWS, KeyboardInterrupt(), INTERRUPTED),
         (ROWS, ZeroDivisionError("no mass"), FAILURE),
+        ([], None, FAILURE),
     ],
 )
 def test_files_and_exit_status(
@@ -76,7 +78,8 @@ def test_files_and_exit_status(
     found = json.loads((tmp_path / "made_up.json").read_text(encoding="utf-8"))
     assert found["rows"][: len(rows)] == json_value(rows)
     added = [row["note"] for row in found["rows"][len(rows) :]]
-    assert added == (["ended by ZeroDivisionError: no mass"] if isinstance(ends, ZeroDivisionError) else [])
+    failures = ["ended by ZeroDivisionError: no mass"] if isinstance(ends, ZeroDivisionError) else []
+    assert added == (failures if rows else ["nothing was measured: no case fits the settings"])
     assert found["effort"]["name"] == "quick"
     assert found["machine"]["processor_name"]
     assert "Made up" in (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -88,6 +91,9 @@ def test_settings_override_the_effort() -> None:
     )
     assert (changed.starts, changed.only, changed.scenes) == (3, ("masses", "poses"), ("payload",))
     assert (changed.duration, changed.peers, changed.name) == (2, False, "standard")
+    assert STANDARD.changed(("seed=0", "compared_starts=0", "only=[]")) == replace(
+        STANDARD, compared_starts=0
+    )
     assert STANDARD.changed(("kernel_timing=[3, 0.1]",)).kernel_timing == Sampling(3, 0.1)
     assert QUICK.changed(("maneuvers=payload", "tolerances=[1, 1e-3]")).tolerances == (1, 1e-3)
 
@@ -109,6 +115,11 @@ def test_settings_override_the_effort() -> None:
         "mass_ratios=[-1.0]",
         "scenes=[3]",
         "only=[",
+        "batch_sizes=[]",
+        "horizons=[]",
+        "samples=0",
+        "starts=0",
+        "kernel_timing=[3, 0.0]",
     ],
 )
 def test_a_wrong_setting_is_named(setting: str) -> None:

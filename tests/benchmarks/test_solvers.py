@@ -15,11 +15,12 @@ from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import QUICK
 from scripts.benchmarks.harness import Row, select, shortcomings
-from scripts.benchmarks.solvers import _compare, receding
+from scripts.benchmarks.solvers import _compare, constrained, random_starts, receding
 from scripts.benchmarks.solvers import accuracy as contenders_module
 from scripts.benchmarks.solvers.accuracy import OURS, Contender, best_costs, compare_solvers, contenders
 from scripts.benchmarks.solvers.iterations import measure_iterations
 from scripts.benchmarks.solvers.random_starts import (
+    UNSOLVED,
     draw_starts,
     judged,
     measure_starts,
@@ -223,6 +224,33 @@ def test_shares_of_random_starts() -> None:
     assert [summary[key] for key in ("converged", "succeeded", "both", "close")] == [0.75, 0.75, 0.5, 0.5]
     for key in counts:
         assert (summary[f"{key}_median"], summary[f"{key}_90"]) == pytest.approx((2.5, 3.7))
+
+
+def test_a_share_of_one_in_a_hundred_is_no_more_than_that() -> None:
+    counts = dict.fromkeys(("iterations", "long_step_iterations", "seconds"), 1)
+    rows = [{"converged": i > 1, "success": True, "gap": 0.0, **counts} for i in range(200)]
+    assert summarized(rows)["unsolved"] == UNSOLVED
+    assert summarized(rows)["missed"] == 0.0
+
+
+def test_the_judge_compares_its_guesses_without_long_steps_too(
+    problem: ArmProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(random_starts, "FURTHER_GUESSES", 2)
+    for coarsening in (1, 2):
+        judge = random_starts._judge(problem, GuidedDDP(problem, coarsening=coarsening), SHORT)
+        assert judge.compare == (coarsening == 1)
+
+
+def test_starts_under_constraints_that_are_not_solved_are_told() -> None:
+    row = {"solver": GUIDED, "solved": True, "above_same": None}
+    rows = [row] * 9 + [{**row, "solved": False}]
+    assert shortcomings(constrained.claims("scene", rows)) == []
+    (sentence,) = shortcomings(constrained.claims("scene", [{**row, "solved": False}, *rows]))
+    assert sentence.startswith(f"constrained: scene, {GUIDED}: the error 1.8e-01 is above 0.1")
+    above = [*rows, {**row, "above_same": 1e-5}]
+    (sentence,) = shortcomings(constrained.claims("scene", above))
+    assert sentence.endswith("J above theirs in the same minimum")
 
 
 def test_starts_of_a_seed_are_the_same_however_many(problem: ArmProblem) -> None:

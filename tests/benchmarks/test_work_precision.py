@@ -346,6 +346,10 @@ def test_a_scene_is_judged_by_its_own_integrator() -> None:
     unmeasured = result(LOW, HIGH, integrator="rk8", shipped=True)
     assert own_choice(unmeasured) is None
     assert shortcomings(rows_of(unmeasured)) == []
+    for lost, said in ((0.1, ["scenes: up, rk4: the error is not finite. its own"]), (1.0, [])):
+        blown_up = replace(HIGH, points=HIGH.points[1:], lost=[lost])
+        found = shortcomings(rows_of(result(LOW, blown_up, shipped=True)))
+        assert [sentence[: len(start)] for sentence, start in zip(found, said, strict=True)] == said
 
 
 def test_the_maneuver_of_a_scene_is_followed() -> None:
