@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Any
 
 from rich.console import Console
 
+import dq_space_arm_env
+import experts
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.progress import ProgressDisplay, Status
@@ -33,7 +36,7 @@ NAME = "report"
 def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False) -> Page:
     """Measure a scene and write report.html, report.md and report.json after each part.
 
-    An interrupted report of the same scene, effort and version, on a machine of the same kind, resumes: its
+    An interrupted report of the same scene, effort and source, on a machine of the same kind, resumes: its
     parts are kept.
 
     Args:
@@ -57,6 +60,7 @@ def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False)
         "quick": quick,
         "versions": origin["versions"],
         "commit": origin["commit"],
+        "source": _source_hash(),
     }
     found = _unfinished(folder / f"{NAME}.json", {"request": request, "machine": origin["machine"]})
     if found:
@@ -79,6 +83,15 @@ def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False)
         sections[name].print(console)
     console.print(f"{folder}: {', '.join(files)}", markup=False)
     return page
+
+
+def _source_hash() -> str:
+    """Hash of what is measured: a commit does not tell which of its files were changed."""
+    digest = hashlib.sha256()
+    for package in (dq_space_arm_env, experts):
+        for path in sorted(Path(str(package.__file__)).parent.rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _measured(name: str, scene: Scene, effort: Effort, console: Console) -> dict[str, Any]:

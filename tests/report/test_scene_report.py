@@ -356,6 +356,19 @@ def test_times_of_another_machine_are_not_kept(
     assert [part.measured for part in parts.values()] == [2, 2]
 
 
+def test_times_of_other_source_are_not_kept(
+    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A changed file of a checkout that was changed before leaves its commit as it is."""
+    parts = {"first": MadeUpPart(), "second": MadeUpPart(interrupts=True)}
+    monkeypatch.setattr(scene_report, "PARTS", parts)
+    with pytest.raises(KeyboardInterrupt):
+        scene_report.report(short_scene, tmp_path, Console(), quick=True)
+    monkeypatch.setattr(scene_report, "_source_hash", lambda: "changed")
+    scene_report.report(short_scene, tmp_path, Console(), quick=True)
+    assert [part.measured for part in parts.values()] == [2, 2]
+
+
 def test_a_part_that_refuses_the_scene_says_so(
     short_scene: Scene,
     tmp_path: Path,
