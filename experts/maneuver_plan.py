@@ -54,6 +54,10 @@ class ManeuverPlan:
         library = [_last_stages(solution, problem.horizon) for solution in known]
         solver = GuidedDDP(problem, library=library, reserve=planner.reserve) if stage > 0 else planner
         solution = uninterrupted(solver.solve(state, parameters=problem.parameters.rows))
+        nothing = f"there is no plan from the state at stage {stage}: {solution.message}"
+        # Under constraints it has no multipliers to go on with.
+        if solution.stop_reason is StopReason.DIVERGED:
+            raise RuntimeError(nothing)
         if solution.constraints is not None and problem.constraints is None:
             rows, maneuver = maneuver.parameters.rows, maneuver.constrained(planner.reserve)
             maneuver.parameters.set(rows)
@@ -70,8 +74,8 @@ class ManeuverPlan:
         # The exact model may have no minimum where the solver ran out of iterations.
         models = (True, False) if exact else (False,)
         found = any(work.backward_pass(0.0, exact=model).completed for model in models)
-        if solution.stop_reason is StopReason.DIVERGED or not found:
-            raise RuntimeError(f"there is no plan from the state at stage {stage}: {solution.message}")
+        if not found:
+            raise RuntimeError(nothing)
         hessians = _convex_part(work.update.Vxx_all)
         held = problem.parameters.more.copy()
         reached = solution.converged and maneuver.is_success(solution.states, solution.controls)

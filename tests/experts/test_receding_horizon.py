@@ -477,6 +477,19 @@ def test_a_state_beyond_all_bounds_falls_back_to_the_plan_and_is_counted(paper, 
     assert paper.fallbacks == 0
 
 
+def test_a_state_beyond_all_bounds_ends_no_flight_under_constraints(short_scene):
+    limits = {"kind": "joint_limits", "name": "limits", "lower": -2, "upper": 2}
+    expert = RecedingHorizonExpert(short_scene.replace(constraints=[limits]), 10)
+    wild = expert.maneuver.initial_state.copy()
+    wild[expert.maneuver.kernels.layout.state.joint_rates] = 1e200
+    with pytest.raises(RuntimeError, match="no plan from the state at stage 0: the first rollout"):
+        expert(wild)
+    expert(expert.maneuver.initial_state)
+    expert.inform(expert.maneuver.parameters.nominal)
+    assert np.isfinite(expert(wild)).all()
+    assert (expert.rejected_plans, expert.fallbacks) == (1, 1)
+
+
 def test_the_plan_knows_what_remains_to_be_paid(plans):
     """The gradient of the remaining cost is what solves from displaced states say."""
     problem, plan = ArmProblem("paper"), plans["paper"]
