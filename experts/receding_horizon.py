@@ -22,6 +22,7 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.scene.start import unit_quaternions
 from dq_space_arm_env.task.step_report import n_observations
 from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Solution
@@ -38,6 +39,10 @@ WORTHWHILE = 1e-12
 """A smaller predicted reduction, relative to the plan's cost, is not tried: rounding would decide."""
 
 
+ROUNDING = 1e-6
+"""How far a quaternion of single precision may be off unit norm."""
+
+
 class MeasurementError(ValueError):
     """A measurement that is no state: it has numbers that are not finite, or a zero quaternion."""
 
@@ -48,7 +53,7 @@ class RecedingHorizonExpert:
     Observations of `DQSpaceArm-v0` reveal the stage by the time left; the first one, and any with no less
     time left than the last, begins a new episode. States do not reveal it: calls are counted, and `reset`
     begins an episode. The two are told apart by their lengths: an observation has more entries, n_obs, than a
-    state, n_x. Poses are normalized.
+    state, n_x. Poses and rotations are normalized.
 
     A measurement that is no state, with numbers that are not finite or a zero quaternion, is an error where
     an episode begins. Within an episode the expert flies on: the state that its last solution predicts for
@@ -257,13 +262,13 @@ class RecedingHorizonExpert:
         try:
             if len(given) == self.maneuver.n_states:
                 check_array("state", given, given.shape)
-                return self._of_unit_norm(given)
+                return self._with_unit_rotations(self._of_unit_norm(given))
             check_array("observation", given, given.shape)
             with np.errstate(invalid="ignore", divide="ignore"):
                 parameters = self.maneuver.parameters.rows[stage]
                 state = self.maneuver.kernels.state_from_observation(given, p=parameters)
             check_array("the state behind the observation", state, state.shape)
-            return state
+            return self._with_unit_rotations(state)
         except ValueError as error:
             raise MeasurementError(str(error)) from error
 
@@ -287,6 +292,16 @@ class RecedingHorizonExpert:
         result = state.copy()
         result[layout.state.pose] = np.array(dual_quaternion.normalize(pose.tolist()))[stored]
         return result
+
+    def _with_unit_rotations(self, state: FloatArray) -> FloatArray:
+        """Normalize quaternions of spherical joints in place, but for their rounding; return the state."""
+        for where in unit_quaternions(self.maneuver.scene):
+            length = float(np.linalg.norm(state[where]))
+            if length == 0.0:
+                raise ValueError("the quaternion of a spherical joint is zero; its norm must be 1")
+            if abs(length - 1.0) > ROUNDING:
+                state[where] /= length
+        return state
 
     def _begin(self, state: FloatArray, stage: int) -> None:
         """Plan an episode."""

@@ -10,11 +10,13 @@ import pytest
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.start import unit_quaternions
 from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
 from experts.guesses.guided import RESERVE
 from experts.maneuver_plan import ManeuverPlan, _convex_part
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.window_problem import WindowProblem
+from experts.receding_horizon import MeasurementError
 
 SCENES = ("paper", "payload")
 
@@ -528,6 +530,21 @@ def test_where_the_cheapest_maneuver_misses_the_target_it_is_reached_all_the_sam
         state = kernels.step(state, expert(state) * expert.maneuver.control_upper)
     assert expert.maneuver.misses(expert.plan.solution.states[-1]) <= 1.0 - RESERVE
     assert expert.maneuver.misses(state) <= 1.0 - RESERVE
+
+
+def test_measured_rotations_of_joints_need_not_be_of_unit_norm():
+    expert = RecedingHorizonExpert("heavy-wrist")
+    start, (joint,) = expert.maneuver.initial_state, unit_quaternions(expert.maneuver.scene)
+    measured, kept = start.copy(), start.copy()
+    measured[joint] *= 1.01
+    found = expert._state_of(measured, 0)
+    expert.maneuver.check_state("found", found)  # as at the start of a plan
+    np.testing.assert_allclose(found, start, rtol=0, atol=1e-15)
+    kept[joint] *= 1.0 + 1e-8
+    np.testing.assert_array_equal(expert._state_of(kept, 0)[joint], kept[joint])
+    measured[joint] = 0.0
+    with pytest.raises(MeasurementError, match="quaternion of a spherical joint is zero"):
+        expert(measured)
 
 
 def test_a_measured_quaternion_need_not_be_of_unit_norm(paper):
