@@ -311,7 +311,11 @@ class RecedingHorizonExpert:
         if stage > 0:
             with self.maneuver.parameters.being(None):
                 known = self._planner.library
-        self.plan = ManeuverPlan.make(self._planner, state, stage, known)
+        rows = self.maneuver.parameters.rows.copy()
+        try:
+            self.plan = ManeuverPlan.make(self._planner, state, stage, known)
+        finally:  # an interrupt may leave the nominal ones, with which the planner prepares itself
+            self.maneuver.parameters.rows[:] = rows
         self._forget(stage)
 
     def _forget(self, stage: int) -> None:

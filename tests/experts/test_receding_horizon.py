@@ -12,6 +12,7 @@ from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.start import unit_quaternions
 from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
+from experts.guesses import guided
 from experts.guesses.guided import RESERVE
 from experts.maneuver_plan import ManeuverPlan, _convex_part
 from experts.problems.arm_problem import ArmProblem
@@ -368,6 +369,21 @@ def test_reset_plans_at_once_if_it_is_told_the_start(paper):
     paper.reset()
     assert paper.plan is None
     np.testing.assert_array_equal(paper(start), first)
+
+
+def test_an_interrupted_plan_keeps_what_the_expert_was_told(spread_scene, monkeypatch):
+    def interrupted(solver):
+        solver.problem.parameters.set(None)  # as the search for long steps does
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(guided, "read_preparation", lambda key: None)
+    monkeypatch.setattr(guided, "find_coarsening", interrupted)
+    expert = RecedingHorizonExpert(spread_scene.replace(spread={"target_position": 0.1}), 10)
+    told = expert.maneuver.parameters.nominal + 0.01
+    with pytest.raises(KeyboardInterrupt):
+        expert.reset(expert.maneuver.initial_state, parameters=told)
+    assert expert.plan is None
+    np.testing.assert_array_equal(expert.maneuver.parameters.rows, np.tile(told, (61, 1)))
 
 
 def test_the_end_of_an_episode_is_an_error(experts, plans):
