@@ -48,6 +48,8 @@ def _run(options: argparse.Namespace) -> int:
     check_gif(options.fps, options.hold, options.colors)
     ending = options.out.suffix.lower()
     is_strip = ending == ".png"
+    if not options.seconds > 0.0:
+        raise ValueError(f"seconds: {options.seconds}, should be positive")
     if is_strip and options.moments < 2:
         raise ValueError(f"moments: {options.moments}, should be at least 2: the start and the end")
     check_writable_file(options.out)

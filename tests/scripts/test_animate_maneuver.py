@@ -18,6 +18,7 @@ LARGEST, LARGEST_IN_ALL = 120_000, 2_500_000  # bytes
     ("options", "sentence"),
     [
         (["--fps", "60"], "fps: 60.0, should be positive and at most 50"),
+        (["--seconds", "nan"], "seconds: nan, should be positive"),
         (["--hold", "-1"], "hold: -1.0, should be 0 to 600 s"),
         (["--colors", "256"], "colors: 256, should be 2 to 255"),
         (["--width", "0"], "width: 0 is not a positive number of pixels"),
