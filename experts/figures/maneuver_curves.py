@@ -126,6 +126,8 @@ def _limit_note(actuator: ActuatorHistory, drawn: list[float]) -> str:
     limits = sorted(set(actuator.limits.tolist()))
     if len(limits) > 1:
         return "dashed: limits" if drawn else "limits off the scale"
+    if limits[0] == np.inf:
+        return "no limit"
     sides = "0 to " if actuator.name == "thruster_force" else "±"
     written = f"{sides}{limits[0]:g} {actuator.unit}"
     return f"dashed: limit {written}" if drawn else f"limit {written}, off the scale"
@@ -134,7 +136,7 @@ def _limit_note(actuator: ActuatorHistory, drawn: list[float]) -> str:
 def _symbols(maneuver: Maneuver, actuator: ActuatorHistory) -> list[str]:
     """Symbols of the inputs: by axis, joint number or Euler angle."""
     if actuator.name == "joint_torque":
-        return [rf"$\tau_{joint + 1}$" for joint in StateLayout.of(maneuver.scene).actuated_joints]
+        return [rf"$\tau_{{{joint + 1}}}$" for joint in StateLayout.of(maneuver.scene).actuated_joints]
     if actuator.name == "wrist_rate":
         return list(_EULER_RATES)
     if actuator.name in ("wheel_torque", "thruster_force"):

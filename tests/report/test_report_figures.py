@@ -15,7 +15,7 @@ from matplotlib.image import imread  # noqa: E402
 from dq_space_arm_env import Scene, load_scene  # noqa: E402
 from dq_space_arm_env.algebra import dual_quaternion  # noqa: E402
 from dq_space_arm_env.algebra.poses import position, to_matrix  # noqa: E402
-from dq_space_arm_env.scene import StateLayout  # noqa: E402
+from dq_space_arm_env.scene import InitialState, StateLayout  # noqa: E402
 from dq_space_arm_env.scene.path import shown_target  # noqa: E402
 from experts.figures import write_figures, write_readme_picture  # noqa: E402
 from experts.figures.maneuver_curves import convergence_figure, figure_3, figure_4, figure_5, figure_6  # noqa: E402
@@ -39,6 +39,17 @@ def test_figure_3_shows_the_error_pose(paper_maneuver: Maneuver) -> None:
     assert lower.get_ylabel() == "position [m]"
     looks = [(line.get_color(), line._dash_pattern) for line in upper.lines]
     assert len({color for color, _ in looks}) == len({str(pattern) for _, pattern in looks}) == 4
+
+
+def test_joints_from_the_tenth_on_have_two_digits_below_and_no_limit_is_none(short_scene: Scene) -> None:
+    link = short_scene.links[0]
+    links = [link.model_copy(update={"name": f"link {i}"}) for i in range(11)]
+    actuators = {"joint_torque": {"limit": np.inf}}
+    scene = short_scene.replace(links=links, actuators=actuators, initial_state=InitialState())
+    (axes,) = figure_6(still(scene)).axes
+    named = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert named[8:] == [r"$\tau_{9}$", r"$\tau_{10}$", r"$\tau_{11}$"]
+    assert axes.get_title(loc="left") == "Joint torques (no limit)"
 
 
 def test_figure_4_is_in_degrees_and_meters(paper_maneuver: Maneuver) -> None:
