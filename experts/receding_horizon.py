@@ -262,13 +262,13 @@ class RecedingHorizonExpert:
         try:
             if len(given) == self.maneuver.n_states:
                 check_array("state", given, given.shape)
-                return self._with_unit_rotations(self._of_unit_norm(given))
+                return self._plausible(self._of_unit_norm(given))
             check_array("observation", given, given.shape)
             with np.errstate(invalid="ignore", divide="ignore"):
                 parameters = self.maneuver.parameters.rows[stage]
                 state = self.maneuver.kernels.state_from_observation(given, p=parameters)
             check_array("the state behind the observation", state, state.shape)
-            return self._with_unit_rotations(state)
+            return self._plausible(state)
         except ValueError as error:
             raise MeasurementError(str(error)) from error
 
@@ -293,8 +293,16 @@ class RecedingHorizonExpert:
         result[layout.state.pose] = np.array(dual_quaternion.normalize(pose.tolist()))[stored]
         return result
 
-    def _with_unit_rotations(self, state: FloatArray) -> FloatArray:
-        """Normalize quaternions of spherical joints in place, but for their rounding; return the state."""
+    def _plausible(self, state: FloatArray) -> FloatArray:
+        """Correct a measured state in place, and return it.
+
+        Quaternions of spherical joints are normalized, but for their rounding. Previous controls were within
+        bounds: rates would keep the next ones near them.
+        """
+        limits = self.maneuver.rate_limits
+        if limits.states.size:
+            lower, upper = (bound[:, limits.controls] for bound in stage_bounds(self.maneuver))
+            state[limits.states] = np.clip(state[limits.states], lower.min(axis=0), upper.max(axis=0))
         for where in unit_quaternions(self.maneuver.scene):
             length = float(np.linalg.norm(state[where]))
             if length == 0.0:

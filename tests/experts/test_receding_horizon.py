@@ -508,6 +508,21 @@ def test_a_state_beyond_all_bounds_ends_no_flight_under_constraints(short_scene)
     assert (expert.rejected_plans, expert.fallbacks) == (1, 1)
 
 
+def test_a_wild_previous_control_leaves_actions_within_the_limits(short_scene):
+    rate = {"kind": "control_rate", "name": "slowly", "base_torque": 1.0}
+    expert = RecedingHorizonExpert(short_scene.replace(constraints=[rate]), 10)
+    (previous,) = expert.maneuver.rate_limits.states
+    start = expert.maneuver.initial_state
+    expert(start)
+    wild = start.copy()
+    wild[previous] = 1e3
+    assert np.abs(expert(wild)).max() <= 1.0
+    assert expert.control[0] >= 2.0 - 0.05  # a step from the limit
+    expert.inform(expert.maneuver.parameters.nominal)  # a plan from there begins within the limits
+    assert np.abs(expert(wild)).max() <= 1.0
+    assert expert.replans == 1
+
+
 def test_the_plan_knows_what_remains_to_be_paid(plans):
     """The gradient of the remaining cost is what solves from displaced states say."""
     problem, plan = ArmProblem("paper"), plans["paper"]
