@@ -46,7 +46,7 @@ VALIDATION_SEED = 1
 _HEADER = "# The resolved configuration of this run.\n"
 _DIGITS = 12
 _PART = ".part"
-_POINT = ("environment_steps", "success_rate", "median_cost")  # numbers of a learning curve that count
+_POINT = ("environment_steps", "seconds", "success_rate", "median_cost")  # of learning curves
 _REMEDY = "repair it, or use another folder"
 
 
@@ -141,9 +141,9 @@ class RunFolder:
             if other != final and (_is_complete(other) or other.suffix == _PART):
                 shutil.rmtree(other, ignore_errors=True)
 
-    def evaluations(self, until: int | None = None) -> list[dict[str, Any]]:
-        """Lines of the learning curve, up to a number of environment steps."""
-        lines = learned(self.path)
+    def evaluations(self, until: int | None = None, names: Sequence[str] = ()) -> list[dict[str, Any]]:
+        """Lines of the learning curve, up to a number of environment steps, with numbers of these names."""
+        lines = learned(self.path, names)
         return [line for line in lines if until is None or line["environment_steps"] <= until]
 
     def write_evaluations(self, lines: list[dict[str, Any]]) -> None:
@@ -151,10 +151,13 @@ class RunFolder:
         write_atomically(self.path / EVALUATIONS, text)
 
 
-def learned(path: Path) -> list[dict[str, Any]]:
-    """The learning curve in a run's folder, its lines in order; RunFolderError if it is damaged."""
-    file = path / EVALUATIONS
-    return [_point(file, line) for line in _text(file).splitlines()] if file.exists() else []
+def learned(path: Path, names: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """The learning curve in a run's folder, its lines in order; RunFolderError if it is damaged.
+
+    Lines have steps, seconds, success and cost; `names` are those of further numbers.
+    """
+    file, needed = path / EVALUATIONS, (*_POINT, *names)
+    return [_point(file, line, needed) for line in _text(file).splitlines()] if file.exists() else []
 
 
 def validation_seeds(episodes: int) -> list[int]:
@@ -196,13 +199,13 @@ def _parsed(file: Path, text: str) -> Any:
         raise RunFolderError(f"{file} is damaged ({error}): {_REMEDY}") from error
 
 
-def _point(file: Path, line: str) -> dict[str, Any]:
+def _point(file: Path, line: str, needed: Sequence[str]) -> dict[str, Any]:
     """A point of the learning curve."""
     point = _parsed(file, line)
-    numbers = [point.get(name) for name in _POINT] if isinstance(point, dict) else [None]
+    numbers = [point.get(name) for name in needed] if isinstance(point, dict) else [None]
     if not all(isinstance(number, int | float) for number in numbers):
         raise RunFolderError(
-            f"{file} is damaged ({shortened(point)} lacks a number of {', '.join(_POINT)}): {_REMEDY}"
+            f"{file} is damaged ({shortened(point)} lacks a number of {', '.join(needed)}): {_REMEDY}"
         )
     return dict(point)
 

@@ -195,6 +195,7 @@ class _Learner:
         progression, total = self._configuration.progression, self._settings.updates
         begin = perf_counter() - self._seconds
         seeds = validation_seeds(progression.evaluation_episodes)
+        curve = folder.evaluations(names=["updates"])
         while self._updates < total:
             cost = self._update()
             self._seconds = perf_counter() - begin
@@ -205,8 +206,9 @@ class _Learner:
                 report(Status(done, total, f"{line}, {timedelta(seconds=round(left))} left"))
             if done % progression.evaluate_every == 0 or done == total:
                 found = validate(self.export({}), self._scene, seeds)
-                lines = [line for line in folder.evaluations() if line["updates"] < done]
-                folder.write_evaluations([*lines, {**self.effort(), **found}])
+                # A resumed run repeats what came after its checkpoint.
+                curve = [*(line for line in curve if line["updates"] < done), {**self.effort(), **found}]
+                folder.write_evaluations(curve)
                 begin = perf_counter() - self._seconds  # flights are no training
             if done % progression.checkpoint_every == 0 or done == total:
                 folder.add_checkpoint(done, self._write)

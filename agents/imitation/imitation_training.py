@@ -93,17 +93,19 @@ class _Curve:
         self._every, self._scene, self._folder = configuration.curve.every, scene, folder
         self._seeds = validation_seeds(configuration.curve.episodes)
         self._solved_in, self._writer = solved_in, writer
+        self._lines = folder.evaluations(names=["updates"])
 
     def add(self, network: NormalizedNetwork, record: Record, is_last: bool) -> Record:
         """Fly if it is time to, add a line to the curve, and return the results of the flights."""
         # A resumed run repeats what came after its checkpoint.
-        lines = [line for line in self._folder.evaluations() if line["updates"] < record["updates"]]
-        flown = lines[-1]["updates"] if lines else 0.0
+        self._lines = [line for line in self._lines if line["updates"] < record["updates"]]
+        flown = self._lines[-1]["updates"] if self._lines else 0.0
         found: Record = {}
         if is_last or record["updates"] - flown >= self._every:
             found = validate(network.export({}), self._scene, self._seeds)
             line = {**record, **found, "seconds": round(record["seconds"] + self._solved_in, 3)}
-            self._folder.write_evaluations([*lines, line])
+            self._lines.append(line)
+            self._folder.write_evaluations(self._lines)
         for name, value in {**record, **found}.items():
             if name != "updates":
                 self._writer.add_scalar(name, value, int(record["updates"]))

@@ -71,13 +71,19 @@ class TrainingCallback(BaseCallback):
         self._configuration, self._scene, self._folder = configuration, scene, folder
         self._before, self._report = before, report
         self._started = perf_counter()
-        self._curve = folder.evaluations(until=before.environment_steps)
+        self._curve = folder.evaluations(until=before.environment_steps, names=self._measured)
         folder.write_evaluations(self._curve)
         self._best = max(map(_score, self._curve), default=None)
         schedule = configuration.schedule
         self._next_evaluation = _next(before.environment_steps, schedule.evaluate_every)
         self._next_checkpoint = _next(before.environment_steps, schedule.checkpoint_every)
         self._seeds = validation_seeds(schedule.evaluation_episodes)
+
+    @property
+    def _measured(self) -> tuple[str, ...]:
+        """What the best policy is chosen by, beside what all learning curves have."""
+        charged = getattr(self._configuration.algorithm, "lagrangian", None) is not None
+        return ("multiplier", "violating_episodes") if charged else ()
 
     @property
     def progress(self) -> Progress:

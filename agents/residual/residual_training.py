@@ -125,6 +125,10 @@ class ResidualCallback(TrainingCallback):
         self._uncorrected = fly_mismatched(plan, scene, self._plans, self._worlds)
         self._best_saving = max((line["saving"] for line in self._curve), default=-np.inf)
 
+    @property
+    def _measured(self) -> tuple[str, ...]:
+        return ("saving",)
+
     def metadata(self) -> dict[str, Any]:
         """Metadata of the policy's file: its training so far, and how it flies."""
         practice = self._residual.environment

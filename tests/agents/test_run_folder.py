@@ -101,13 +101,19 @@ def test_the_learning_curve_is_read_up_to_a_number_of_steps(
 ) -> None:
     folder = RunFolder(tmp_path, configuration)
     lines = [
-        {"environment_steps": steps, "success_rate": steps / 40, "median_cost": 1.0} for steps in (10, 20, 30)
+        {"environment_steps": steps, "seconds": 1.0, "success_rate": steps / 40, "median_cost": 1.0}
+        for steps in (10, 20, 30)
     ]
     folder.write_evaluations(lines)
     assert folder.evaluations() == lines
     assert folder.evaluations(20) == lines[:2]
     folder.write_evaluations(lines[:1])
     assert folder.evaluations() == lines[:1]
+    with pytest.raises(RunFolderError, match=r"jsonl is damaged .* lacks a number of .*, updates"):
+        folder.evaluations(names=["updates"])
+    folder.write_evaluations([{name: lines[0][name] for name in lines[0] if name != "seconds"}])
+    with pytest.raises(RunFolderError, match="lacks a number of environment_steps, seconds"):
+        folder.evaluations()
 
 
 def test_a_folder_is_locked_and_free_again(tmp_path: Path) -> None:

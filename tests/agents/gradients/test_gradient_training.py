@@ -290,6 +290,15 @@ def test_a_damaged_checkpoint_is_refused(small_file, tmp_path):
         train_by_gradients(settings(small_file, updates=20), tmp_path)
 
 
+def test_a_learning_curve_of_another_kind_is_refused_before_the_training(small_file, tmp_path):
+    """As one of reinforcement learning, whose lines have no updates."""
+    line = '{"environment_steps": 40, "seconds": 1.0, "success_rate": 0.0, "median_cost": 2.0}\n'
+    (tmp_path / "evaluations.jsonl").write_text(line)
+    with pytest.raises(RunFolderError, match=r"jsonl is damaged .* lacks a number of .*, updates"):
+        train_by_gradients(settings(small_file, updates=3), tmp_path)
+    assert not list((tmp_path / "checkpoints").iterdir())
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -15,7 +15,7 @@ from agents import ExportedPolicy  # noqa: E402
 from agents.imitation.action_chunking import Chunks  # noqa: E402
 from agents.imitation.trainer import TrainingAdvance  # noqa: E402
 from agents.policies.chunking import load_exported  # noqa: E402
-from agents.run_folder import validate, validation_seeds  # noqa: E402
+from agents.run_folder import RunFolderError, validate, validation_seeds  # noqa: E402
 from agents.training import train  # noqa: E402
 from dq_space_arm_env.command_line import main  # noqa: E402
 from dq_space_arm_env.common.progress import ProgressDisplay  # noqa: E402
@@ -79,6 +79,15 @@ def test_the_folder_says_what_was_done(runs, demonstrations):
     assert (training["environment_steps"], training["updates"]) == (0, 120)
     assert training["expert_solves"] == training["demonstrations"] == len(demonstrations)
     assert training["seconds"] > 0.0
+
+
+def test_a_learning_curve_of_another_kind_is_refused_before_the_training(settings, tmp_path):
+    """As one of reinforcement learning, whose lines have no updates."""
+    line = '{"environment_steps": 40, "seconds": 1.0, "success_rate": 0.0, "median_cost": 2.0}\n'
+    (tmp_path / "evaluations.jsonl").write_text(line)
+    with pytest.raises(RunFolderError, match=r"jsonl is damaged .* lacks a number of .*, updates"):
+        train(settings("cloning"), tmp_path)
+    assert not list((tmp_path / "checkpoints").iterdir())
 
 
 def test_corrections_go_on_where_cloning_ends(runs):

@@ -15,9 +15,10 @@ pytest.importorskip("sb3_contrib")
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.configuration import ConfigurationError, load_configuration
-from agents.reinforcement.callback import _score
+from agents.reinforcement.callback import TrainingCallback, _score
 from agents.reinforcement.lagrangian import Lagrangian
-from agents.run_folder import RunFolder
+from agents.reinforcement.training_progress import Progress
+from agents.run_folder import RunFolder, RunFolderError
 from agents.training import train
 from agents.vec_env import SB3VecEnv
 from agents.wrappers.vector import RepeatAction
@@ -151,6 +152,15 @@ def kept(path):
         del line["seconds"]
     with np.load(checkpoint / "arrays.npz") as arrays:
         return dict(arrays), (checkpoint / "learner.pth").read_bytes(), state, curve
+
+
+def test_a_learning_curve_without_what_the_best_policy_is_chosen_by_is_refused(limited, tmp_path):
+    settings = configuration(limited, lagrangian={"limit": 0.1})
+    folder = RunFolder(tmp_path, settings)
+    line = {"environment_steps": 0, "seconds": 1.0, "success_rate": 0.0, "median_cost": 2.0}
+    folder.write_evaluations([{**line, "multiplier": 0.1}])
+    with pytest.raises(RunFolderError, match=r"lacks a number of .*, multiplier, violating_episodes"):
+        TrainingCallback(settings, load_scene(settings.scene), folder, Progress(), print)
 
 
 def test_a_run_resumes_with_its_multiplier_in_the_middle_of_episodes(limited, tmp_path):
