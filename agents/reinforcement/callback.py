@@ -133,6 +133,8 @@ class TrainingCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         # The only point where the learner has used all the data it has gathered.
         self.check_network()
+        if self.is_time_up:  # the end evaluates and writes a checkpoint in any case
+            raise TimeIsUp
         steps, schedule = self.progress.environment_steps, self._configuration.schedule
         if steps >= self._next_evaluation:
             self._next_evaluation = _next(steps, schedule.evaluate_every)
@@ -141,8 +143,6 @@ class TrainingCallback(BaseCallback):
             self._next_checkpoint = _next(steps, schedule.checkpoint_every)
             self.write_checkpoint()
         self._report(self._advance())
-        if self.is_time_up:
-            raise TimeIsUp
 
     def write_checkpoint(self) -> None:
         progress = self.progress

@@ -389,6 +389,14 @@ def test_a_run_whose_time_is_up_resumes_to_the_same_weights(trained, scene_file,
         np.testing.assert_array_equal(actual, expected)
 
 
+def test_a_run_whose_time_is_up_where_it_evaluates_does_so_once(scene_file, tmp_path, monkeypatch):
+    over = property(lambda callback: callback.progress.environment_steps >= 1600)
+    monkeypatch.setattr(TrainingCallback, "is_time_up", over)
+    assert train(configuration("PPO", scene_file), tmp_path).model.num_timesteps * REPEAT == 1600
+    curve = [json.loads(line) for line in (tmp_path / "evaluations.jsonl").read_text().splitlines()]
+    assert [line["environment_steps"] for line in curve] == [1600]
+
+
 @pytest.mark.parametrize(
     ("algorithm", "part", "changes", "sentence"),
     [
