@@ -32,7 +32,10 @@ class SharedDemonstrations:
 
     def provided(self, task: TrainingTask) -> TrainingTask:
         """The task, once its folder exists with its demonstrations."""
-        task.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            task.folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return task  # its training fails where it does not see the folder; others may not
         source, place = _generated(task.configuration.resolved()), task.folder / DEMONSTRATIONS
         if source is None:
             return task

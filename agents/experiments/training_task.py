@@ -64,6 +64,8 @@ class TrainingTask(NamedTuple):
         An error is a result: the other trainings do not depend on this one. ImportError is raised.
         """
         try:
+            if self.folder.is_file():
+                raise RunFolderError(f"{self.folder} is a file, it should be a folder: rename it")
             if not self.folder.is_dir() or not self.place.is_dir():
                 raise RunFolderError(
                     f"machine {platform.node()} does not see {self.folder} and {self.place}: trainings on a "

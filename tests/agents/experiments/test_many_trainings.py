@@ -158,6 +158,15 @@ def test_a_machine_without_the_folder_says_so(configuration: AgentConfiguration,
     assert "trainings on a cluster need a file system that all of its machines share" in row["failure"]
 
 
+def test_a_file_in_the_place_of_a_run_folder_stops_no_other_training(
+    configuration: AgentConfiguration, tmp_path: Path
+) -> None:
+    (tmp_path / "quick-0").touch()
+    rows = train_seeds([configuration], 2, tmp_path, executor=SerialExecutor())
+    assert [row["outcome"] for row in rows] == ["failed", "trained"]
+    assert "quick-0 is a file, it should be a folder" in rows[0]["failure"]
+
+
 def test_a_policy_of_another_configuration_is_not_taken_for_this_training(
     configuration: AgentConfiguration, tmp_path: Path
 ) -> None:
