@@ -73,4 +73,5 @@ class Plans:
         """Apply the feedback gains of stage k to measured states x, shape (B, n_x)."""
         deviation = kernels.difference(self.states[self.chosen, stage], measured)
         feedback = (self.gains[self.chosen, stage] @ deviation[:, :, None])[:, :, 0]
-        return Followed(np.clip(self.planned(stage) + feedback, -1.0, 1.0), deviation)
+        least = kernels.layout.lower_limits(np.ones(kernels.n_u))
+        return Followed(np.clip(self.planned(stage) + feedback, least, 1.0), deviation)

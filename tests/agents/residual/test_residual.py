@@ -110,6 +110,23 @@ def test_corrections_are_bounded_and_sums_within_the_limits():
     np.testing.assert_allclose(many, [[0.1, -0.2], [1.0, -1.0]])
 
 
+def test_corrections_of_thrusters_begin_where_these_do():
+    """A thruster does not pull: what feedback asks for below zero takes nothing from a correction."""
+    scene = load_scene("thrusters")
+    kernels, stage = compile_scene(scene), 3
+    layout, steps = kernels.layout, scene.simulation.steps
+    gains = np.zeros((1, steps, kernels.n_u, kernels.n_t), dtype=np.float32)
+    gains[..., -1] = -1.0
+    states = np.tile(layout.initial_state, (1, steps + 1, 1))
+    plans = Plans(
+        states, np.zeros((1, steps, kernels.n_u)), gains, np.zeros((1, kernels.n_p)), np.zeros(1, int)
+    )
+    measured = kernels.retract(states[:, stage], 0.3 * np.eye(kernels.n_t)[-1:])
+    action = plans.follow(kernels, stage, measured).action[0]
+    expected = np.where(np.arange(kernels.n_u) < layout.control.thruster_force.start, -0.3, 0.0)
+    np.testing.assert_allclose(action, expected, rtol=0, atol=1e-12)
+
+
 def test_corrections_are_held(small_scene, plans):
     asked = []
 
