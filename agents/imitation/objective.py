@@ -45,7 +45,6 @@ class Objective:
 
     def __init__(self, kernels: Kernels, statistics: Statistics, weights: ObjectiveWeights) -> None:
         self._kernels, self._weights, self._spread = kernels, weights, statistics.spread
-        self._action_deviation = statistics.action_deviation
         self._least = kernels.layout.lower_limits(np.ones(kernels.n_u))
         self._gain_size = torch.from_numpy(statistics.gain_size.astype(np.float32))
 
