@@ -29,6 +29,7 @@ from experts.demonstrations.reading import Batch
 
 CHECKPOINT = "checkpoint.pt"
 MOST_BYTES = 1 << 30  # of a checkpoint that is read
+RECORD_BYTES = 1 << 10  # of a record of its history, at most; a few numbers with their names
 VALIDATION_BATCHES = 32  # at most; the same time steps every time
 UPDATES_BETWEEN_MESSAGES = 20
 FINAL_RATE = 1e-3  # learning rate at the end, relative to its peak
@@ -144,7 +145,9 @@ class Trainer(Generic[N]):
         With validation data, the network ends with the weights of the lowest validation loss.
         """
         if folder is not None:
-            self._resume(folder / CHECKPOINT, _load_checkpoint(folder, identity))
+            records = self._optimization.updates // self._validate_every + 1
+            content = _load_checkpoint(folder, identity, records)
+            self._resume(folder / CHECKPOINT, content)
         self._begin = perf_counter() - self._seconds
         reporter = _Reporter(self._optimization.updates, self._updates, self._part, progress)
         while self._updates < self._optimization.updates:
@@ -297,13 +300,16 @@ def _save_checkpoint(folder: Path, content: dict[str, Any]) -> None:
     write_atomically(folder / CHECKPOINT, stream.getvalue())
 
 
-def _load_checkpoint(folder: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
-    """Read a checkpoint of a training with this identity, if there is one; nothing in it is executed."""
+def _load_checkpoint(folder: Path, identity: dict[str, Any], records: int) -> dict[str, Any] | None:
+    """Read a checkpoint of a training with this identity, if there is one; nothing in it is executed.
+
+    Its history has so many records at most.
+    """
     path = folder / CHECKPOINT
     if not path.is_file():
         return None
     try:
-        content = read_tensors(read_bytes(path, MOST_BYTES))
+        content = read_tensors(read_bytes(path, MOST_BYTES), more=RECORD_BYTES * records)
         found = differences(content["identity"], identity)
     except Exception as error:  # damaged bytes make the reader raise anything
         raise CheckpointError(_DAMAGED.format(path, error)) from error

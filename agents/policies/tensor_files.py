@@ -19,7 +19,7 @@ class TensorFileError(ValueError):
     """A file does not hold tensors alone, or is damaged."""
 
 
-def read_tensors(content: bytes) -> Any:
+def read_tensors(content: bytes, *, more: int = 0) -> Any:
     """Read what `torch.save` wrote, if it consists of tensors, numbers, text and containers alone.
 
     PyTorch's own restriction, `weights_only`, allows somewhat more, such as arrays of any length from a few
@@ -27,6 +27,7 @@ def read_tensors(content: bytes) -> Any:
 
     Args:
         content: Bytes of the file.
+        more: Bytes that the description may have beyond `MOST_STRUCTURE`, for numbers beside the tensors.
 
     Returns:
         The tensors in their containers, on the CPU.
@@ -38,7 +39,7 @@ def read_tensors(content: bytes) -> Any:
     import torch
 
     try:
-        _check_structure(content)
+        _check_structure(content, MOST_STRUCTURE + more)
         return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except TensorFileError:
         raise
@@ -62,15 +63,15 @@ def read_tensors(content: bytes) -> Any:
         raise TensorFileError(f"damaged ({reason})") from error
 
 
-def _check_structure(content: bytes) -> None:
+def _check_structure(content: bytes, most: int) -> None:
     """Refuse files that ask for more than tensors, or for more memory than they have bytes."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
             raise TensorFileError("compressed, which PyTorch's files are not")
         (structure,) = (member for member in members if member.filename.endswith("/data.pkl"))
-        if structure.file_size > MOST_STRUCTURE:
-            raise TensorFileError(f"{structure.file_size:,} bytes of structure, should be {MOST_STRUCTURE:,}")
+        if structure.file_size > most:
+            raise TensorFileError(f"{structure.file_size:,} bytes of structure, should be {most:,} at most")
         pickled = archive.read(structure)
     for instruction, argument, _ in pickletools.genops(pickled):
         if instruction.name in ("STACK_GLOBAL", "INST"):

@@ -1,5 +1,7 @@
 """Training on demonstrations: it learns, it can be interrupted, and gains teach more than actions alone."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -84,6 +86,18 @@ def test_an_interrupted_training_ends_with_the_same_weights(quick, demonstration
     assert told[0].done == {20: 20, 100: 60, 180: 160}[stop]
     # Nothing is left to be done.
     assert torch.equal(weights(learn(demonstrations, folder=tmp_path)), weights(quick))
+
+
+def test_a_checkpoint_may_have_as_long_a_history_as_there_are_validations(
+    demonstrations, tmp_path, monkeypatch
+):
+    often = cloning(updates=100, validation_share=0.0).model_copy(update={"validate_every": 1})
+    first = learn(demonstrations, often, tmp_path)
+    with zipfile.ZipFile(tmp_path / CHECKPOINT) as archive:
+        (structure,) = (each for each in archive.infolist() if each.filename.endswith("data.pkl"))
+    assert structure.file_size > 10_000
+    monkeypatch.setattr("agents.policies.tensor_files.MOST_STRUCTURE", 10_000)
+    assert losses(learn(demonstrations, often, tmp_path)) == losses(first)
 
 
 def test_a_damaged_checkpoint_and_that_of_another_training_are_refused(demonstrations, tmp_path):
