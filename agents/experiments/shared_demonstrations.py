@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from agents.configuration import SAC, AgentConfiguration, DemonstrationSource, ImitationConfiguration
@@ -50,7 +51,8 @@ class SharedDemonstrations:
                 return task  # its training fails with this error; others may not
             self._made[key] = place
         elif not place.exists():
-            _link(self._made[key], place)
+            with suppress(OSError):  # its training generates them, or fails likewise; others may not
+                _link(self._made[key], place)
         return task
 
     def remember(self, task: TrainingTask) -> None:

@@ -226,7 +226,9 @@ def test_seeds_are_summarized_without_failures() -> None:
     assert summary["median_cost"] == 250.0  # without the lowest and the highest quarter
 
 
-def test_demonstrations_are_generated_once_and_linked(small_file: Path, tmp_path: Path) -> None:
+def test_demonstrations_are_generated_once_and_linked(
+    small_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = {"name": "clone", "scene": str(small_file), "demonstrations": {"problems": 2, "seed": 0}}
     configuration = load_configuration({**settings, "algorithm": {"name": "cloning"}})
     other = load_configuration(
@@ -245,6 +247,14 @@ def test_demonstrations_are_generated_once_and_linked(small_file: Path, tmp_path
     assert not (tmp_path / "clone-0" / "demonstrations" / "manifest.json").samefile(
         tmp_path / "clone-1" / "demonstrations" / "manifest.json"
     )
+
+    def fail(source: Path, target: Path) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("agents.experiments.shared_demonstrations._link", fail)
+    alone = training_task(configuration.model_copy(update={"seed": 2}), tmp_path)
+    assert shared.provided(alone) is alone  # its training says what is wrong, if it still is
+    assert not list(alone.folder.iterdir())
 
 
 def test_two_runs_may_link_the_same_demonstrations_at_once(
