@@ -64,7 +64,9 @@ def decision_times(scene: Scene, decisions: int, crowding: float) -> Array:
     times = [np.zeros(1)]
     for start, end in pairwise((*starts, steps)):
         begun, due = sum(map(len, times)) - 1, max(1, round(decisions * end / steps))
-        count, single = max(1, due - begun), end < steps
+        single = end < steps
+        # Before that step there is another decision, unless it is all of the phase.
+        count = 1 if single and end - start == 1 else max(1 + single, due - begun)
         even = np.linspace(0.0, 1.0, count - single + 1)
         ends = 0.5 * (1.0 - np.cos(np.pi * even))
         spread = (end - single - start) * dt * (even + crowding * (ends - even))

@@ -23,6 +23,7 @@ from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
 pytestmark = pytest.mark.agents
 
 COUNT, DECISIONS, HIDDEN, SEEDS = 16, 30, 12, list(range(16))
+EIGHT = load_scene("planar").replace(simulation={"steps": 8})
 
 
 class Flown:
@@ -70,13 +71,13 @@ class Flown:
 MISMATCH = FlightMismatch(mass_factors=(1.0,), noise=0.0, push=0.05, pushes=3, delay=1.0)
 
 
-def with_phases(scene):
-    """A scene whose base becomes lighter after a step in which the robot coasts, and the pose counts."""
+def with_phases(scene, coast=1):
+    """A scene whose base becomes lighter after steps in which the robot coasts, and the pose counts."""
     coasting = {"actuators": {"base_force": None, "base_torque": None, "joint_torque": None}}
     phases = [
         {"name": "full", "steps": scene.simulation.steps // 2},
-        {"name": "coast", "steps": 1, "changes": {**coasting, "cost.pose": 1e4}},
-        {"name": "light", "steps": (scene.simulation.steps - 1) // 2, "changes": {"base.mass": 60}},
+        {"name": "coast", "steps": coast, "changes": {**coasting, "cost.pose": 1e4}},
+        {"name": "light", "steps": -(-scene.simulation.steps // 2) - coast, "changes": {"base.mass": 60}},
     ]
     return scene.replace(name="phased", phases=phases)
 
@@ -307,6 +308,31 @@ def test_decisions_fly_as_at_every_time_step(phased):
     assert errors[0] < 5e-3
     assert errors[1] < 0.35 * errors[0]
     assert errors[2] < 0.35 * errors[1]  # not so if actions were not half a time step old
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coast", [2, 10])
+def test_phases_shorter_than_a_share_of_decisions_count_in_full(coast):
+    scene = with_phases(load_scene("planar"), coast)
+    flights = rollout(Flown(scene).policy(), scene, SEEDS)
+    np.testing.assert_allclose(Flown(scene, 40).costs(), flights.cost, rtol=5e-3)
+
+
+@pytest.mark.parametrize("coast", [1, 2, 10])
+def test_the_last_decision_of_a_phase_is_a_time_step(coast):
+    """Where there are more steps in the phase, another one is before it."""
+    scene = with_phases(load_scene("planar"), coast)
+    dt, half = scene.simulation.dt, scene.simulation.steps // 2
+    times = np.rint(decision_times(scene, 40, 0.4) / dt)
+    inside = times[(times >= half) & (times <= half + coast)] - half
+    np.testing.assert_array_equal(inside, sorted({0, coast - 1, coast}))
+
+
+def test_no_decision_takes_no_time():
+    """Where there are more of them than time steps, the last of a phase is still one of these."""
+    times = decision_times(with_phases(EIGHT), 40, 0.4)
+    assert np.diff(times).min() > 0.0
+    np.testing.assert_allclose(times[-1], EIGHT.simulation.steps * EIGHT.simulation.dt, rtol=1e-12)
 
 
 @pytest.mark.parametrize("without", ["push", "delay"])
