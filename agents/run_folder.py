@@ -71,18 +71,19 @@ def reserved(path: Path) -> Iterator[None]:
 class RunFolder:
     """A run's folder at `path`, created or reopened for a configuration.
 
-    Raises `RunFolderError` if it was started with another configuration or another version of the scene.
+    Raises `RunFolderError` if it was started with another configuration or another version of the scene, and
+    holds something since; what ended before, as a wrong value does, leaves no run.
     """
 
     def __init__(self, path: Path, configuration: AgentConfiguration) -> None:
         self.path = path
         (path / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
         here = configuration.resolved().model_dump(mode="json", exclude_none=True)
-        file = path / CONFIGURATION
+        file, found, has_begun = path / CONFIGURATION, [], self._has_begun()
         if file.exists():
             there = load_configuration(file).resolved().model_dump(mode="json", exclude_none=True)
             found = differences(_identity(there), _identity(here))
-            if found:
+            if found and has_begun:
                 raise RunFolderError(
                     f"{path} was started with another configuration: {'; '.join(found)}. Use that one, or "
                     "use another folder (--out)"
@@ -90,15 +91,23 @@ class RunFolder:
         # A configuration only names its scene; the file of that name may have changed.
         scene = load_scene(configuration.scene).content_hash()
         starts = self._starts()
-        if any(start.get("scene_hash", scene) != scene for start in starts):
+        is_other = any(start.get("scene_hash", scene) != scene for start in starts)
+        if is_other and has_begun:
             raise RunFolderError(
                 f"{path} was started with another version of scene {configuration.scene!r}: use another "
                 "folder (--out)"
             )
+        if found or is_other:
+            starts = []
         write_atomically(file, dump_yaml(here, _HEADER), durable=True)
         origin = provenance("ruamel.yaml", "sb3-contrib", "stable-baselines3", "torch")
         starts.append({**origin, "scene_hash": scene})
         write_atomically(path / PROVENANCE, json.dumps(starts, indent=2) + "\n")
+
+    def _has_begun(self) -> bool:
+        """Whether something was made here that belongs to a configuration and a scene."""
+        made = (EVALUATIONS, TENSORBOARD, DEMONSTRATIONS, BEST, POLICY, MODEL)
+        return any((self.path / name).exists() for name in made) or any((self.path / CHECKPOINTS).iterdir())
 
     def _starts(self) -> list[dict[str, Any]]:
         file = self.path / PROVENANCE

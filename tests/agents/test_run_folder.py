@@ -48,6 +48,7 @@ def test_another_configuration_is_refused_but_for_its_length_and_description(
     schedule = configuration.schedule
     longer = schedule.model_copy(update={"total_steps": 2 * schedule.total_steps})
     RunFolder(tmp_path, configuration.model_copy(update={"schedule": longer}))
+    RunFolder(tmp_path, configuration).add_checkpoint(1, save("first"))
     before = contents(tmp_path)
     with pytest.raises(RunFolderError, match=r"another configuration: .*name"):
         RunFolder(tmp_path, configuration.model_copy(update={"name": "another"}))
@@ -57,6 +58,21 @@ def test_another_configuration_is_refused_but_for_its_length_and_description(
     with pytest.raises(RunFolderError, match="another version of scene"):
         RunFolder(tmp_path, configuration)
     assert (tmp_path / "config.yaml").read_text() == before["config.yaml"]
+
+
+def test_a_mistake_that_is_corrected_is_no_other_run(
+    tmp_path: Path, configuration: AgentConfiguration
+) -> None:
+    """As that in a scene or the path of demonstrations: nothing has been trained."""
+    RunFolder(tmp_path, configuration.model_copy(update={"start_from": "nowhere"}))
+    starts = json.loads((tmp_path / "provenance.json").read_text())
+    (tmp_path / "provenance.json").write_text(json.dumps([{**starts[0], "scene_hash": "0" * 64}]))
+    RunFolder(tmp_path, configuration).write_evaluations([])
+    assert load_configuration(tmp_path / "config.yaml") == configuration
+    assert len(json.loads((tmp_path / "provenance.json").read_text())) == 1
+    RunFolder(tmp_path, configuration)  # and goes on
+    with pytest.raises(RunFolderError, match=r"another configuration: .*start_from"):
+        RunFolder(tmp_path, configuration.model_copy(update={"start_from": "nowhere"}))
 
 
 def test_a_checkpoint_replaces_the_last_one_and_what_killed_runs_left(

@@ -318,7 +318,7 @@ def test_a_folder_is_for_one_configuration_and_scene_but_may_get_more_time(scene
     path = tmp_path / "scene.yaml"
     path.write_bytes(scene_file.read_bytes())
     for changes in ({}, {"total_steps": 6400}, {"description": "the same in other words"}):
-        RunFolder(tmp_path / "run", configuration("PPO", path, **changes))
+        RunFolder(tmp_path / "run", configuration("PPO", path, **changes)).write_evaluations([])
     with pytest.raises(RunFolderError, match="seed is 0 there and 1 here"):
         RunFolder(tmp_path / "run", configuration("PPO", path, seed=1))
     PAPER.replace(name="short", simulation={"dt": 0.01, "steps": STEPS}).to_yaml(path)

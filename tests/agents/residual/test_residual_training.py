@@ -207,7 +207,7 @@ def test_it_trains_exports_and_resumes(algorithm, configuration, small_scene, de
 
 
 def test_a_folder_or_a_scene_that_does_not_fit_is_refused(configuration, tmp_path):
-    RunFolder(tmp_path / "run", configuration())
+    RunFolder(tmp_path / "run", configuration()).write_evaluations([])
     with pytest.raises(RunFolderError, match="seed is 0 there and 1 here"):
         train_residual(configuration(seed=1), tmp_path / "run")
     with pytest.raises(DemonstrationsError, match="demonstrations of another scene than 'paper'"):
