@@ -29,12 +29,21 @@ EIGHT = load_scene("planar").replace(simulation={"steps": 8})
 class Flown:
     """Episodes of a small scene, flown by a random network."""
 
-    def __init__(self, scene, decisions=DECISIONS, outputs=3.0, *, noisy=False, dtype=np.float32):
+    def __init__(
+        self,
+        scene,
+        decisions=DECISIONS,
+        outputs=3.0,
+        *,
+        hidden=(HIDDEN, HIDDEN),
+        noisy=False,
+        dtype=np.float32,
+    ):
         environment = DQSpaceArmVectorEnv(COUNT, scene)
         seen = environment.reset(seed=SEEDS)[0]
         self.states, n_u = environment.states, environment.kernels.n_u
         rng = np.random.default_rng(0)
-        weights = random_weights([seen.shape[1], HIDDEN, HIDDEN, n_u], rng)
+        weights = random_weights([seen.shape[1], *hidden, n_u], rng)
         self.weights = [each.astype(dtype) for each in weights]
         self.weights[-2] *= np.float32(outputs)
         self.mean, deviation = seen.mean(axis=0), seen.std(axis=0)
@@ -104,6 +113,22 @@ def test_gradients_agree_with_differences(small_scene, monkeypatch, case):
         weight[:] = kept
         expected = (ends[0] - ends[1]) / 2.0
         assert expected == pytest.approx(float((slope * direction).sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "hidden", [(33, 7), *(pytest.param(each, marks=pytest.mark.slow) for each in ((), (5,), (33, 7, 16)))]
+)  # loops are compiled for each depth
+def test_outputs_are_those_of_the_exported_policy(small_scene, hidden):
+    """Of layers that fill no whole vectors of numbers, for episodes that fill no whole tiles."""
+    flown = Flown(small_scene, outputs=30.0, hidden=hidden)
+    flown.costs()
+    observations, outputs = flown.episodes._flown.observations, flown.episodes._layers.outputs
+    seen = observations.reshape(-1, observations.shape[-1])
+    expected = flown.policy()(seen) / 0.05
+    inside = np.abs(expected) < 1.0  # beyond, it clips them
+    assert inside.mean() > 0.4
+    found = outputs.reshape(expected.shape)
+    np.testing.assert_allclose(found[inside], expected[inside], rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("phases", [False, True])
