@@ -56,8 +56,6 @@ class Network(NamedTuple):
     transposes: tuple[Array, ...]
     biases: tuple[Array, ...]
     zeros: Array  # as many as the widest layer has
-    outputs: Array  # the last of the values
-    by_outputs: Array  # the last of the cotangents
 
 
 class Flown(NamedTuple):
@@ -81,9 +79,8 @@ class Slopes(NamedTuple):
 
     by_state: Array  # of what follows a decision, (K + 1, B, n_t)
     by_output: Array  # (K, B, n_u); holds those of the roughness at first
-    by_input: Array  # of a decision's first substep, (B, n_u)
-    by_held: Array  # of another one
-    by_inputs: Array  # of all
+    by_input: Array  # of a substep, (B, n_u)
+    by_inputs: Array  # of all of a decision, (B, n_u)
     by_observation: Array  # (B, n_obs)
     by_observed: Array  # (B, n_t)
     lost: NDArray[np.bool_]  # episodes that do not count, (B,)
@@ -96,20 +93,20 @@ def fly_decisions(
     first: int, end: int, calls: Calls, network: Network, arrivals: Arrivals, flown: Flown
 ) -> None:
     """Fly the decisions from the first to the last before the end."""
-    count = flown.inputs.shape[1]
+    count, last = flown.inputs.shape[1], len(network.matrices)
     for k in range(first, end):
         call_kernel(calls.observation.address, 0, count, calls.observation.tables[k])
         _normalize(network.values[0][k], flown.observations[k], flown.mean, flown.scale)
-        for index in range(len(network.matrices)):
+        for index in range(last):
             _layer(
                 network.values[index + 1][k],
                 network.values[index][k],
                 network.matrices[index],
                 network.biases[index],
             )
-            if index + 1 < len(network.matrices):
+            if index + 1 < last:
                 _to_tanh(network.values[index + 1][k])
-        _act(k, network.outputs, arrivals, flown)
+        _act(k, network.values[last], arrivals, flown)
         call_kernel(calls.step.address, 0, count, calls.step.tables[k])
         for substep in range(calls.further_begins[k], calls.further_begins[k + 1]):
             call_kernel(calls.further_step.address, 0, count, calls.further_step.tables[substep])
@@ -137,11 +134,11 @@ def trace_back_decisions(
         slopes.by_inputs[:] = 0.0
         for substep in range(calls.further_begins[k + 1] - 1, calls.further_begins[k] - 1, -1):
             call_kernel(calls.further_step_back.address, 0, count, calls.further_step_back.tables[substep])
-            _add(slopes.by_inputs, slopes.by_held)
+            _add(slopes.by_inputs, slopes.by_input)
         call_kernel(calls.step_back.address, 0, count, calls.step_back.tables[k])
         _add(slopes.by_inputs, slopes.by_input)
         _act_back(k, arrivals, flown, slopes, kept)
-        _put_in(network.by_outputs[k], slopes.by_output[k])
+        _put_in(network.cotangents[last][k], slopes.by_output[k])
         for index in range(last, 0, -1):
             if index < last:
                 _through_tanh(network.cotangents[index][k], network.values[index][k])
@@ -201,6 +198,7 @@ def _layer(target: Array, given: Array, matrix: Array, bias: Array) -> None:
 
 @part
 def _normalize(target: Array, observations: Array, mean: Array, scale: Array) -> None:
+    """Turn observations (B, n_obs) into inputs of the network, whose rows are padded."""
     for i in range(observations.shape[0]):
         for j in range(observations.shape[1]):
             target[i, j] = (observations[i, j] - mean[j]) * scale[j]
@@ -208,6 +206,7 @@ def _normalize(target: Array, observations: Array, mean: Array, scale: Array) ->
 
 @part
 def _normalize_back(target: Array, cotangents: Array, scale: Array, kept: int) -> None:
+    """Turn slopes by inputs of the network into those by observations, (B, n_obs), no longer divided."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = cotangents[i, j] * (scale[j] * kept)
@@ -223,6 +222,7 @@ def _put_in(target: Array, source: Array) -> None:
 
 @part
 def _add(target: Array, more: Array) -> None:
+    """Add a matrix to another of its shape."""
     for i in range(more.shape[0]):
         for j in range(more.shape[1]):
             target[i, j] += more[i, j]

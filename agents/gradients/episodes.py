@@ -135,7 +135,6 @@ class Episodes:
             by_state=zeros(decisions + 1, kernels.n_t),
             by_output=np.zeros((decisions, count, kernels.n_u)),
             by_input=zeros(kernels.n_u),
-            by_held=zeros(kernels.n_u),
             by_inputs=zeros(kernels.n_u),
             by_observation=zeros(n_obs),
             by_observed=zeros(kernels.n_t),
@@ -208,7 +207,7 @@ class Episodes:
         for index in range(1, self.substeps[k]):
             step = {**given, "x": states[index], "x_next": states[index + 1]}
             back = {**given, "x": states[index], "v": slopes[index + 1], "x_cotangent": slopes[index]}
-            yield {"step": step, "vjp": {**back, "u_cotangent": self._slopes.by_held}}
+            yield {"step": step, "vjp": {**back, "u_cotangent": self._slopes.by_input}}
 
     def _substep(self, k: int) -> Array:
         """Length of a decision's substeps, s, (1,)."""
@@ -318,7 +317,8 @@ class Episodes:
         if self._met.jumps is None and self._met.noise is None:  # which make outputs rough with good reason
             # A smooth policy pays the fourth power of the steps.
             weights = 2.0 * self.roughness * typical / (kept * len(self.substeps)) * self._inner
-            add_slopes_of_roughness(self._slopes.by_output, self._layers.network.outputs, self.units, weights)
+            outputs = self._layers.network.values[-1]
+            add_slopes_of_roughness(self._slopes.by_output, outputs, self.units, weights)
         steep = STEEP_PENALTIES if self.penalties.are_strict else STEEP
         given = self._calls, self._layers.network, self._arrivals, self._flown
         trace_back_decisions(*given, self._slopes, kept, steep, self._usual)

@@ -59,8 +59,6 @@ class Layers:
             transposes=tuple(zeros(size, count) for size, count in zip(sizes[1:], columns, strict=False)),
             biases=tuple(zeros(count) for count in columns[1:]),
             zeros=zeros(max(columns)),
-            outputs=values[-1],
-            by_outputs=cotangents[-1],
         )
         self.outputs = values[-1][..., : sizes[-1]]
         self._ones = np.ones(decisions * episodes, dtype)  # NumPy sums along the first axis more slowly

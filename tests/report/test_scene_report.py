@@ -342,29 +342,21 @@ def test_an_interrupted_resumption_keeps_the_parts_that_it_found(
     assert [section.name for section in page.sections] == list(parts)
 
 
-def test_times_of_another_machine_are_not_kept(
-    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    parts = {"first": MadeUpPart(), "second": MadeUpPart(interrupts=True)}
-    monkeypatch.setattr(scene_report, "PARTS", parts)
-    with pytest.raises(KeyboardInterrupt):
-        scene_report.report(short_scene, tmp_path, Console(), quick=True)
-    origin = scene_report.provenance()
-    elsewhere = {**origin, "machine": {**origin["machine"], "processor_name": "another"}}
-    monkeypatch.setattr(scene_report, "provenance", lambda: elsewhere)
-    scene_report.report(short_scene, tmp_path, Console(), quick=True)
-    assert [part.measured for part in parts.values()] == [2, 2]
-
-
-def test_times_of_other_source_are_not_kept(
-    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("changed", ["machine", "source"])
+def test_times_of_another_machine_or_source_are_not_kept(
+    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
 ) -> None:
     """A changed file of a checkout that was changed before leaves its commit as it is."""
     parts = {"first": MadeUpPart(), "second": MadeUpPart(interrupts=True)}
     monkeypatch.setattr(scene_report, "PARTS", parts)
     with pytest.raises(KeyboardInterrupt):
         scene_report.report(short_scene, tmp_path, Console(), quick=True)
-    monkeypatch.setattr(scene_report, "_source_hash", lambda: "changed")
+    origin = scene_report.provenance()
+    elsewhere = {**origin, "machine": {**origin["machine"], "processor_name": "another"}}
+    if changed == "machine":
+        monkeypatch.setattr(scene_report, "provenance", lambda: elsewhere)
+    else:
+        monkeypatch.setattr(scene_report, "_source_hash", lambda: "changed")
     scene_report.report(short_scene, tmp_path, Console(), quick=True)
     assert [part.measured for part in parts.values()] == [2, 2]
 
