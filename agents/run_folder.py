@@ -30,7 +30,13 @@ import numpy as np
 from agents.configuration import AgentConfiguration, load_configuration
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json, read_text
-from dq_space_arm_env.common.files import differences, remove_leftovers, temporary_name, write_atomically
+from dq_space_arm_env.common.files import (
+    differences,
+    flush,
+    remove_leftovers,
+    temporary_name,
+    write_atomically,
+)
 from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.shown_text import shortened
@@ -145,7 +151,9 @@ class RunFolder:
         temporary = folder / temporary_name(final.name)
         temporary.mkdir()
         write(temporary)
+        flush(temporary)
         temporary.rename(final)
+        flush(folder)
         for other in folder.iterdir():
             if other != final and (_is_complete(other) or other.suffix == _PART):
                 shutil.rmtree(other, ignore_errors=True)

@@ -91,8 +91,8 @@ def _replace(
     finally:
         with contextlib.suppress(OSError):  # where it could not be made, it cannot be removed
             temporary.unlink()
-    if durable and os.name != "nt":  # Windows opens no folders
-        _flush(path.parent)
+    if durable:
+        _flush_names(path.parent)
 
 
 def _target(path: Path) -> tuple[Path, int | None]:
@@ -107,8 +107,19 @@ def _target(path: Path) -> tuple[Path, int | None]:
     return target, stat.S_IMODE(mode)
 
 
-def _flush(folder: Path) -> None:
-    """Wait until the disk has the entries of a folder."""
+def flush(folder: Path) -> None:
+    """Wait until the disk has the files in a folder, and the names of all that is in it."""
+    for path in folder.iterdir():
+        if path.is_file():
+            with path.open("rb+") as file:
+                os.fsync(file.fileno())
+    _flush_names(folder)
+
+
+def _flush_names(folder: Path) -> None:
+    """Wait until the disk has the names of what is in a folder."""
+    if os.name == "nt":  # Windows opens no folders
+        return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from agents import run_folder
 from agents.configuration import AgentConfiguration, load_configuration
 from agents.run_folder import RunFolder, RunFolderError, reserved, validation_seeds
 
@@ -89,6 +90,21 @@ def test_a_checkpoint_replaces_the_last_one_and_what_killed_runs_left(
     last = folder.checkpoint()
     assert last is not None
     assert contents(last) == {"model": "second"}
+
+
+def test_a_checkpoint_is_on_disk_before_it_has_its_name(
+    tmp_path: Path, configuration: AgentConfiguration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a power failure the last one may be gone: what replaces it must be whole."""
+    folder, seen = RunFolder(tmp_path, configuration), []
+
+    def note(place: Path) -> None:
+        seen.append((place == tmp_path / "checkpoints", sorted(path.suffix for path in place.iterdir())))
+
+    monkeypatch.setattr(run_folder, "flush", note)
+    folder.add_checkpoint(900, save("first"))
+    folder.add_checkpoint(1000, save("second"))
+    assert seen == [(False, [""]), (True, [""]), (False, [""]), (True, ["", ""])]  # then the old one goes
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(

@@ -15,6 +15,7 @@ import pytest
 
 from dq_space_arm_env.common.files import (
     check_writable_file,
+    flush,
     json_value,
     remove_leftovers,
     temporary_name,
@@ -98,6 +99,23 @@ def test_content_is_on_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: 
     calls.clear()
     write_atomically(tmp_path / "a.txt", "new")
     assert calls == ["rename"]  # nobody waits for the disk without need
+
+
+def test_a_flushed_folder_has_its_files_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flushed, fsync = [], os.fsync
+
+    def note(descriptor: int) -> None:
+        flushed.append(os.fstat(descriptor).st_ino)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", note)
+    for name in ("model.zip", "state.json"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "further").mkdir()
+    flush(tmp_path)
+    expected = [path for path in tmp_path.iterdir() if path.is_file()]
+    expected += [] if os.name == "nt" else [tmp_path]  # the names at last
+    assert flushed == [path.stat().st_ino for path in expected]
 
 
 @posix
