@@ -13,6 +13,7 @@ BENCHMARKS := work-precision scene-cost solvers throughput rendering
 TEST := test$(if $(CI),$(COMMA)agents$(COMMA)jax$(COMMA)ray$(COMMA)search)
 
 .PHONY: paper docs test lint lock clean
+.NOTPARALLEL: # all goals install into one environment
 
 paper: $(VENV)/installed-plots
 	$(BIN)/python scripts/reproduce_paper.py

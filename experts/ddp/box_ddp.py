@@ -304,6 +304,8 @@ class BoxDDP:
         """Compute the gains around the final trajectory, and judge it without regularization."""
         work, (reason, message) = self._work, stop
         if self._constrained is not None:
+            if reason is not StopReason.CONVERGED:
+                state.optimality = np.inf  # it may be that of an earlier trajectory
             found = self._constrained.finish(stop)
             solution = self._solution(state, found.stop, found.gains)
             return replace(solution, multipliers=found.multipliers, constraints=found.report)

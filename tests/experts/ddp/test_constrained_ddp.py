@@ -162,6 +162,18 @@ def test_penalties_leave_no_trace(solved):
     assert again.cost == pytest.approx(solution.cost, rel=1e-12)
 
 
+@pytest.mark.sampled
+def test_the_optimality_of_an_earlier_trajectory_is_not_told(solved, free):
+    """Steps that were judged go on where constraints ask for more."""
+    problem, solution, _ = solved
+    none = np.zeros_like(problem.constraints.multipliers)
+    given = {"initial_regularization": 1e-3, "max_iterations": solution.iterations - 1}
+    cut = BoxDDP(problem, **given).solve(u_init=free.controls, multipliers=none)
+    assert cut.stop_reason is StopReason.MAX_ITERATIONS
+    assert cut.optimality == math.inf
+    assert solution.optimality < math.inf
+
+
 @pytest.mark.slow
 def test_an_infeasible_scene_is_named():
     """The elbow cannot keep a meter from what it is attached to."""
