@@ -352,13 +352,15 @@ def _first(record: Mapping[str, Any]) -> Mapping[str, Any]:
     return first
 
 
-def _percent(interval: list[float] | None) -> str:
+def _percent(interval: list[float | None] | None) -> str:
     if interval is None:
         return "-"
-    value, low, high = (
-        f"{100.0 * bound:.3g}" if bound < 1.0 else f"{100.0 * bound:.0f}" for bound in interval
+    value, *bounds = (
+        f"{100.0 * bound:.3g}" if bound < 1.0 else f"{100.0 * bound:.0f}"
+        for bound in interval
+        if bound is not None
     )
-    return f"{value} [{low}, {high}]"
+    return f"{value} [{', '.join(bounds)}]" if bounds else value
 
 
 FAILURE = 1

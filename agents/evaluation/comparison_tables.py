@@ -18,10 +18,10 @@ from agents.evaluation.training_runs import Group
 from dq_space_arm_env.common.tables import Column, Row, TextTable, tabulate
 
 
-def percent(interval: Sequence[float]) -> str:
-    """An interval of a share, in per cent on two lines."""
-    value, low, high = (_digits(100.0 * bound) for bound in interval)
-    return f"{value}\n[{low}, {high}]"
+def percent(interval: Sequence[float | None]) -> str:
+    """An interval of a share, in per cent on two lines; the share alone where its bounds are unknown."""
+    value, *bounds = (_digits(100.0 * bound) for bound in interval if bound is not None)
+    return f"{value}\n[{', '.join(bounds)}]" if bounds else value
 
 
 def _digits(value: float) -> str:

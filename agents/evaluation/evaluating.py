@@ -309,6 +309,7 @@ def fly_under(
     return fly(policy, flown, seeds, progress, disturbances=disturbances, delay=delay)
 
 
-def known_interval(interval: Interval) -> list[float] | None:
-    """An interval as JSON values; None if it is NaN."""
-    return None if np.isnan(interval.value) else list(interval)
+def known_interval(interval: Interval) -> list[float | None] | None:
+    """An interval as JSON values; None if it is NaN, and for bounds that are."""
+    found = [None if np.isnan(each) else each for each in interval]
+    return None if found[0] is None else found

@@ -32,7 +32,7 @@ _NORMAL_QUANTILE = 1.959963984540054  # of CONFIDENCE, two-sided
 
 
 class Interval(NamedTuple):
-    """An estimate and its 95 % confidence interval."""
+    """An estimate and its 95 % confidence interval; its bounds are NaN where a single value tells none."""
 
     value: float
     low: float
@@ -64,10 +64,10 @@ def _score_interval(rate: float, n: float, z: float) -> Interval:
 def bootstrap_interval(
     values: ArrayLike, statistic: Callable[[FloatArray], float], *, seed: int = 0
 ) -> Interval:
-    """Percentile bootstrap of a statistic of independent values; NaN without values."""
+    """Percentile bootstrap of a statistic of independent values; NaN without values, and bounds of one."""
     sample = np.asarray(values, dtype=np.float64)
-    if sample.size == 0:
-        return Interval(math.nan, math.nan, math.nan)
+    if sample.size < 2:  # every resample of a single value is this value
+        return Interval(statistic(sample) if sample.size else math.nan, math.nan, math.nan)
     rng = np.random.default_rng(seed)
     resamples = [statistic(sample[rng.integers(len(sample), size=len(sample))]) for _ in range(RESAMPLES)]
     tail = 50.0 * (1.0 - CONFIDENCE)
@@ -144,6 +144,8 @@ def gap_over_runs(gaps: Sequence[ArrayLike]) -> Interval:
         return Interval(math.nan, math.nan, math.nan)
     # The variance of a trimmed mean is that of its winsorized values (Tukey and McLaughlin, Sankhya 1963).
     middle = interquartile_mean(gap)
+    if gap.size == 1:
+        return Interval(middle, math.nan, math.nan)
     _, variance, quantile = _crossed(2.0 * np.clip(gap, *np.quantile(gap, [0.25, 0.75])))
     half = quantile * math.sqrt(variance)
     return Interval(middle, middle - half, middle + half)

@@ -15,7 +15,7 @@ from agents.configuration.schema import RESERVED_SEED
 from agents.demonstrations import check_scene, stricter
 from agents.evaluation.comparing import Comparison, Row, distinct_names, finished
 from agents.evaluation.comparison_tables import mismatch_table
-from agents.evaluation.evaluating import Advance, Evaluation
+from agents.evaluation.evaluating import Advance, Evaluation, known_interval
 from agents.evaluation.evaluation_verbs import progress_bar, save_comparison
 from agents.evaluation.expert_costs import EVALUATION_SEEDS, OptimalCosts, evaluation_seeds
 from agents.evaluation.kept_results import KeptRows
@@ -150,7 +150,7 @@ def _rows(condition: Condition, evaluations: Sequence[Evaluation]) -> Iterator[R
             "mean_cost": float(np.mean(evaluation.flights.cost)),
             "saving": None
             if evaluation is base
-            else list(saving(evaluation.flights.cost, base.flights.cost)),
+            else known_interval(saving(evaluation.flights.cost, base.flights.cost)),
             "learning_curve": [],
         }
         yield Row(evaluation, facts)

@@ -206,6 +206,22 @@ def test_violations_have_intervals_and_columns():
     assert "violat" not in str(evaluation_table([plain]).headings)
 
 
+def test_one_flight_has_gaps_without_intervals():
+    limits = {"kind": "joint_limits", "name": "elbow", "lower": [-4, 0.85, -4], "tolerance": 0.01}  # rad
+    plain = evaluate(gentle, SHORT.replace(constraints=[limits]), 1, expert=False)
+    optimal = OptimalCosts(plain.seeds, np.ones(1), np.ones(1, bool), np.zeros(1))
+    evaluation = dataclasses.replace(plain, optimal=optimal)
+    summary = json.loads(json.dumps(evaluation.summary(), allow_nan=False))
+    for name in ("median_cost_gap", "tail_cost_gap", "constraint_violations"):
+        assert summary[name][1:] == [None, None]
+    assert None not in summary["success_rate"]  # Wilson's interval holds for one flight too
+    table = evaluation_table([evaluation])
+    cells = dict(zip(table.headings, table.rows[0], strict=True))
+    assert float(cells["cost gap\n%"].replace(",", "")) == pytest.approx(
+        100.0 * summary["median_cost_gap"][0], rel=0.01
+    )
+
+
 def test_a_table_shows_costs_where_no_gap_is_known_and_no_empty_column():
     plain = evaluate(gentle, SHORT, 2, expert=False)
     optimal = OptimalCosts(plain.seeds, np.ones(2), np.ones(2, bool), np.zeros(2))

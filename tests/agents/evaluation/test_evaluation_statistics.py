@@ -16,7 +16,7 @@ from agents.evaluation import (
     rate_over_runs,
     wilson_interval,
 )
-from agents.evaluation.statistics import student_quantile
+from agents.evaluation.statistics import gap_over_runs, student_quantile
 
 
 def test_wilsons_interval_of_a_half():
@@ -164,6 +164,14 @@ def test_gaps_of_unknown_optima_are_left_out_in_all_runs():
     runs = compare_runs([np.ones(5)] * 4, gaps * 2)
     assert runs.cost_gap.value == pytest.approx(0.2)
     assert 0.0 < runs.cost_gap.low < 0.2 < runs.cost_gap.high < 0.4
+
+
+def test_a_single_value_tells_no_interval():
+    """Its interval had no width, as that of a result that is known exactly."""
+    unknown = pytest.approx((0.2, math.nan, math.nan), nan_ok=True)
+    for found in (bootstrap_interval([0.2], np.median), *map(gap_over_runs, ([[0.2]], [[math.nan, 0.2]]))):
+        assert found == unknown
+    assert gap_over_runs([[0.2], [0.3]]).low < 0.2
 
 
 def test_impossible_counts_and_too_few_or_unequal_runs_are_refused():
