@@ -26,6 +26,9 @@ GROUP = 25
 """Problems that are solved, compared with each other, and written together."""
 STAGE = f"optimal costs, {GROUP} at a time"
 """Name of the work in messages on its progress."""
+KIND = "optimal-costs"
+"""Folder of the cached rows. Their key has the expert's code, not this file's: where `cost_rows` gives rows
+another meaning, append "/2", or rows of the old meaning are read."""
 
 
 class OptimalCosts(NamedTuple):
@@ -165,7 +168,7 @@ def cost_files(settings: Settings, n: int = 0) -> CachedGroups:
         **software(),
     }
     columns = ("seed", "cost", "is_success", "seconds")
-    return CachedGroups("optimal-costs", content, columns, group_seeds(settings, n), GROUP)
+    return CachedGroups(KIND, content, columns, group_seeds(settings, n), GROUP)
 
 
 def cost_rows(result: ShardResult) -> list[Row]:

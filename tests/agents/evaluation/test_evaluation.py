@@ -15,7 +15,7 @@ from agents.evaluation.comparison_tables import evaluation_table, remarks
 from agents.evaluation.conditions import FlightDisturbance, physics_hash
 from agents.evaluation.evaluating import Evaluation, fly_under
 from agents.evaluation.evaluation_verbs import evaluate_policies
-from agents.evaluation.expert_costs import OptimalCosts
+from agents.evaluation.expert_costs import KIND, OptimalCosts, cost_rows
 from agents.evaluation.statistics import wilson_interval
 from agents.policies import ExportedPolicy
 from agents.policies.flying import time_per_action
@@ -28,7 +28,9 @@ from dq_space_arm_env.environment.rollouts import rollout
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.task.step_report import n_observations
 from experts.demonstrations import SerialExecutor, generate_demonstrations
+from experts.demonstrations.outcomes import MISSED_TARGET, REASONS
 from experts.demonstrations.settings import Settings
+from experts.demonstrations.shard import ShardResult
 
 PAPER = load_scene("paper")
 SHORT = PAPER.replace(name="short", simulation={"dt": 0.015, "steps": 12})
@@ -104,6 +106,27 @@ def test_a_scene_whose_starts_are_all_the_same_is_refused_with_what_helps():
     still = SHORT.replace(spread=dict.fromkeys(type(SHORT.spread).model_fields, 0.0) | {"observed": False})
     with pytest.raises(ValueError, match=r"all evaluation starts are the same: give it a spread, or .*--no"):
         optimal_costs(still, 1)
+
+
+def test_cached_optima_mean_what_the_name_of_their_folder_says():
+    """Caches outlive this code: rows that mean something else need another `KIND`, here too."""
+    safetensors = pytest.importorskip("safetensors.numpy")
+    reasons = (REASONS.index(MISSED_TARGET), REASONS.index("max_iterations"))
+    content = safetensors.save(
+        {
+            **{"index": np.array([26]), "seed": np.array([7]), "cost": np.array([1.5])},
+            **{"failures.index": np.array([25, 27]), "failures.seed": np.array([5, 9])},
+            **{"failures.cost": np.array([2.5, 3.5]), "failures.stop_reason": np.array(reasons)},
+        }
+    )
+    assert (KIND, cost_rows(ShardResult(1, content, "", "", 1, 2, [0.1, 0.2, 0.3], {}))) == (
+        "optimal-costs",
+        [  # an optimum that misses the target is one; what did not converge is none
+            {"seed": 5, "cost": 2.5, "is_success": False, "seconds": 0.1},
+            {"seed": 7, "cost": 1.5, "is_success": True, "seconds": 0.2},
+            {"seed": 9, "cost": None, "is_success": False, "seconds": 0.3},
+        ],
+    )
 
 
 @pytest.mark.slow
