@@ -69,12 +69,8 @@ class Score:
 
     def solves(self, limits: Limits) -> bool:
         """Whether the entrant keeps to the limits of the suite; estimates count, not their intervals."""
-        violating = 0.0 if self.violating is None else self.violating.value
-        return bool(
-            self.success_rate.value >= limits.success
-            and violating <= limits.violating
-            and self.cost_gap.value <= limits.cost_gap
-        )
+        violating = None if self.violating is None else self.violating.value
+        return limits.are_kept(self.success_rate.value, violating, self.cost_gap.value)
 
     def record(self, limits: Limits) -> dict[str, Any]:
         """The score as a row of JSON values."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -40,6 +41,8 @@ _SCORES = (
     *(COLUMNS["violating_episodes"], *_TIMES),
 )
 _MEASURES = ("success_rate", "violating_episodes", "interquartile_mean_cost_gap")
+_SAME = {"name", "starts", "receding_starts", "conditions", "limits", "tasks"}
+"""What the suites of two runs share, where their scores compare."""
 
 
 def suite_page(run: SuiteRun, *, picture: bool = True) -> Page:
@@ -84,7 +87,11 @@ def published(file: str | Path) -> tuple[dict[str, Any], dict[tuple[str, str, st
         tasks = read_mapping(file)["parts"]["tasks"]
         if not isinstance(tasks["suite"], dict):
             raise TypeError(f"parts.tasks.suite: {shortened(tasks['suite'])}, should be a mapping")
-        return tasks["suite"], {_checked_key(row): row for row in tasks["scores"]}
+        keys = [_checked_key(row) for row in tasks["scores"]]
+        for (task, condition, entrant), count in Counter(keys).items():
+            if count > 1:
+                raise TypeError(f"{entrant} has {count} scores in {task}, {condition}")
+        return tasks["suite"], dict(zip(keys, tasks["scores"], strict=True))
     except (UnreadableError, KeyError, TypeError) as error:
         raise SuiteError(f"{file}: is not the JSON file of a suite: {error}") from error
 
@@ -96,11 +103,23 @@ def _checked_key(row: Row) -> tuple[str, str, str]:
         raise TypeError(f"parts.tasks.scores: {shortened(list(key))}, should be texts")
     for name in _MEASURES:
         value = row.get(name)
-        numbers = value if isinstance(value, list) else [value]
-        is_interval = len(numbers) == 3 and all(isinstance(each, int | float) for each in numbers)
-        if value is not None and not is_interval:
-            raise TypeError(f"{name} of {key[2]} in {key[0]}: {shortened(value)}, should be three numbers")
+        if value is not None and not _is_interval(value):
+            raise TypeError(
+                f"{name} of {key[2]} in {key[0]}: {shortened(value)}, should be three numbers, the first "
+                "within the other two"
+            )
     return key
+
+
+def _is_interval(value: Any) -> bool:
+    """Whether JSON values are an estimate between finite bounds, or one whose bounds are unknown."""
+    numbers = value if isinstance(value, list) and len(value) == 3 else [None]
+    if len(numbers) == 3 and numbers[1] is numbers[2] is None:
+        numbers = numbers[:1] * 3
+    if not all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers):
+        return False
+    estimate, low, high = map(float, numbers)
+    return -math.inf < low <= estimate <= high < math.inf
 
 
 def comparable(
@@ -109,10 +128,11 @@ def comparable(
     """Read the JSON file of another run, which has to have scores of these names in these tasks.
 
     Raises:
-        SuiteError: If the file is not one, is of another suite, or has no such score.
+        SuiteError: If the file is not one, contradicts itself, is of another suite, lacks a condition, or has
+            no such score.
     """
     theirs_suite, theirs = published(file)
-    mine = suite.model_dump(mode="json", include={"name", "starts", "tasks"})
+    mine = suite.model_dump(mode="json", include=_SAME)
     found = differences({key: theirs_suite.get(key) for key in mine}, mine)
     if found:
         raise SuiteError(f"{file}: is of another suite than {suite.name!r}: {'; '.join(found)}")
@@ -125,6 +145,15 @@ def comparable(
             f"{file}: has no score of {', '.join(names)} in these tasks, but of {', '.join(known)}: put one "
             "of these names and = before the path of a policy"
         )
+    for (task, condition, name), score in theirs.items():
+        lacking = [each for each in suite.conditions if (task, each, name) not in theirs]
+        if lacking:
+            raise SuiteError(f"{file}: {name} flew in {task}, but not under {', '.join(lacking)}")
+        success, *others = (None if score.get(key) is None else score[key][0] for key in _MEASURES)
+        is_solved = success is not None and suite.limits.are_kept(success, *others)
+        if score.get("solved") is not is_solved:
+            wrong = f"solved is {shortened(score.get('solved'))}, should be {is_solved} by its numbers"
+            raise SuiteError(f"{file}: {name} in {task}, {condition}: {wrong}")
     return theirs
 
 
@@ -175,12 +204,13 @@ def check_columns() -> list[Column]:
     return [*columns, Column("verdict", "")]
 
 
-def _verdict(mine: Sequence[float] | None, theirs: Sequence[float] | None) -> str:
+def _verdict(mine: Sequence[float | None] | None, theirs: Sequence[float | None] | None) -> str:
     if mine is None or theirs is None:
         return "equal" if mine is theirs else "differs"
-    if np.allclose(mine, theirs, rtol=_EQUAL, atol=_EQUAL):
+    here, there = (np.array(each, dtype=np.float64) for each in (mine, theirs))  # NaN for unknown bounds
+    if np.allclose(here, there, rtol=_EQUAL, atol=_EQUAL, equal_nan=True):
         return "equal"
-    return "agrees" if mine[1] <= theirs[2] and theirs[1] <= mine[2] else "differs"
+    return "agrees" if here[1] <= there[2] and there[1] <= here[2] else "differs"
 
 
 def _together(run: SuiteRun, picture: bool) -> Section:

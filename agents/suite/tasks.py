@@ -47,6 +47,11 @@ class Limits(Model):
     violating: Fraction = Field(description="largest share of flights that violate a constraint")
     cost_gap: NonNegative = Field(description="largest interquartile mean of J / J_expert - 1")
 
+    def are_kept(self, success: float, violating: float | None, cost_gap: float | None) -> bool:
+        """Whether a task is solved; no flight violates in a scene without constraints, which has None."""
+        keeps = success >= self.success and (violating is None or violating <= self.violating)
+        return keeps and cost_gap is not None and cost_gap <= self.cost_gap
+
 
 class Suite(Model):
     """A version of the suite."""

@@ -1,6 +1,8 @@
 """The suite: pinned scenes, entrants of all kinds, scores by hand, resuming, the check of others' results."""
 
 import json
+import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -141,7 +143,12 @@ def test_a_missing_run_folder_beside_is_told_as_any_file_is(tmp_path, monkeypatc
         ({"success_rate": "high"}, "success_rate of mine in .*: 'high', should be three numbers"),
         ({"success_rate": [0.5]}, "success_rate of mine"),
         ({"violating_episodes": [0.0, None, 1.0]}, "violating_episodes of mine"),
+        ({"success_rate": [0.9, 0.2, 0.6]}, r"success_rate of mine .* the first within the other two"),
+        ({"success_rate": [True, False, True]}, "success_rate of mine"),
+        ({"interquartile_mean_cost_gap": [0.0, -math.inf, math.inf]}, "cost_gap of mine"),
         ({"entrant": None}, "should be texts"),
+        ({"solved": False}, "mine in .*, training: solved is False, should be True by its numbers"),
+        ({"success_rate": None}, "solved is True, should be False by its numbers"),
     ],
 )
 def test_a_file_with_other_values_is_refused_before_anybody_flies(content, tmp_path, change, said):
@@ -152,6 +159,34 @@ def test_a_file_with_other_values_is_refused_before_anybody_flies(content, tmp_p
     (tmp_path / "theirs.json").write_text(json.dumps(record))
     with pytest.raises(SuiteError, match=said):
         comparable(tmp_path / "theirs.json", suite, suite.tasks, ["mine"])
+
+
+def test_a_file_that_judges_by_other_limits_or_leaves_scores_out_is_refused(content, tmp_path):
+    both = {**content, "conditions": ["training", "push"]}
+    (suite, file), task = (Suite.model_validate(both), tmp_path / "theirs.json"), next(iter(content["tasks"]))
+    flown = made([[True] * 9 + [False]], [[0.0] * 10], task=task, entrant="mine")
+    run = SuiteRun(suite, (flown, replace(flown, condition="push")), {task: ""}, ())
+    record = suite_page(run, picture=False).record["parts"]["tasks"]
+
+    def refused(said, suite=record["suite"], scores=record["scores"]):
+        file.write_text(json.dumps({"parts": {"tasks": {"suite": suite, "scores": scores}}}))
+        with pytest.raises(SuiteError, match=said):
+            check(run, file)
+
+    lenient = {**record["suite"], "limits": {**LIMITS, "success": 0.1}}
+    refused("limits.success is 0.1 there and 0.9 here", suite=lenient)
+    better = {**record["scores"][0], "success_rate": [1.0, 0.7, 1.0]}
+    refused("mine has 2 scores in .*, training", scores=[better, *record["scores"]])
+    refused("mine flew in .*, but not under push", scores=record["scores"][:1])
+
+
+def test_scores_of_one_flight_are_compared_without_an_interval_of_the_gap(content, tmp_path):
+    suite, file = Suite.model_validate(content), tmp_path / "theirs.json"
+    run, other = (SuiteRun(suite, (made([[True]], [[gap]]),), {"a": ""}, ()) for gap in (0.01, 0.02))
+    page = suite_page(run, picture=False)
+    assert page.record["parts"]["tasks"]["scores"][0]["interquartile_mean_cost_gap"][1:] == [None, None]
+    file.write_text(json.dumps(page.record))
+    assert [check(each, file)[0]["verdict"] for each in (run, other)] == ["equal", "differs"]
 
 
 def still(scene):
