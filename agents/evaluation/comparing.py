@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from time import perf_counter
 from types import MappingProxyType
@@ -390,12 +391,14 @@ def finished(
 
 
 def distinct_names(files: Sequence[Path | ActingPolicy]) -> list[str]:
-    """Name policies by the folders of their runs, or by their files, all different."""
+    """Name policies by the folders of their runs, or by their files; all differ, also from controllers."""
     names = [_name(file) for file in files]
-    return [
-        name if names.count(name) == 1 else f"{name} ({names[: i + 1].count(name)})"
-        for i, name in enumerate(names)
-    ]
+    given, found = [*CONTROLLERS.values(), *names], list[str]()
+    for name in names:
+        others = (f"{name} ({number})" for number in count(1))
+        free = (each for each in others if each not in (*given, *found))
+        found.append(name if given.count(name) == 1 else next(free))
+    return found
 
 
 def _name(file: Path | ActingPolicy) -> str:

@@ -177,10 +177,13 @@ def run_suite(
     if not entrants and not policies:
         entrants = (*CONTROLLERS, *chosen.agents, ZOO)
     controllers, agents, files = _sorted_out(entrants, chosen)
-    _check_names([*(CONTROLLERS[each] for each in controllers), *map(agent_name, agents), *files, *policies])
+    _check_names([*_names(controllers, agents, files), *policies])
     fliers = {task: [*_from_files(files, task, scene, trust)] for task, scene in scenes.items()}
     for task, scene in scenes.items():
-        fliers[task] += [(name, as_policy(make(scene), name)) for name, make in policies.items()]
+        made = [(name, as_policy(make(scene), name)) for name, make in policies.items()]
+        for _, acting in made:
+            check_fit(acting, scene)  # before anything is trained
+        fliers[task] += made
     fitting = {name for found in fliers.values() for name, _ in found}
     for name, path in files.items():
         if name not in fitting and name != ZOO:
@@ -246,7 +249,11 @@ def agent_name(agent: str) -> str:
 
 def entrant_names(entrants: Sequence[str], suite: Suite) -> list[str]:
     """Names of entrants in tables, before anything flies; all that ship with the package by default."""
-    controllers, agents, files = _sorted_out(entrants or (*CONTROLLERS, *suite.agents, ZOO), suite)
+    return _names(*_sorted_out(entrants or (*CONTROLLERS, *suite.agents, ZOO), suite))
+
+
+def _names(controllers: Sequence[str], agents: Sequence[str], files: Mapping[str, str]) -> list[str]:
+    """Names in tables, those of all policies that ship with the package included."""
     shelf = [f"{each} ({ZOO})" for each in list_policies()] if ZOO in files else []
     named = [name for name in files if name != ZOO]
     return [*(CONTROLLERS[each] for each in controllers), *map(agent_name, agents), *named, *shelf]
@@ -272,6 +279,8 @@ def _sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[
         else:
             named = _NAMED.fullmatch(entrant)
             name, path = (named[1], named[2]) if named else (entrant, entrant)
+            if named and name == ZOO:
+                raise SuiteError(f"{entrant}: {ZOO} is the policies that ship: put another name before the =")
             if name in files:
                 raise SuiteError(_ONE_NAME.format(name))
             files[name] = path

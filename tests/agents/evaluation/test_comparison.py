@@ -4,6 +4,7 @@ import json
 import math
 import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from agents.command_line.compare import compare as compare_verb
 from agents.command_line.evaluate import evaluate as evaluate_verb
 from agents.configuration import load_configuration
 from agents.evaluation import CONTROLLERS, evaluation_seeds, fly, optimal_costs, scene_under
-from agents.evaluation.comparing import Comparison, Row
+from agents.evaluation.comparing import Comparison, Row, distinct_names
 from agents.evaluation.comparison_tables import (
     comparison_tables,
     group_record,
@@ -306,6 +307,12 @@ def test_the_training_command_is_the_shortest_that_gives_the_configuration(tmp_p
         f"dq-space-arm train {tmp_path / 'config.yaml'}"
     )
     assert training_command({}) is None
+
+
+def test_policies_have_names_apart_from_each_other_and_from_controllers():
+    """What shares a name would share a row's file and a color; of two corrections one would not fly."""
+    files = [Path(name) for name in ("x/a.npz", "y/a.npz", "z/a (1).npz", "b.npz", "plan with gains.npz")]
+    assert distinct_names(files) == ["a (2)", "a (3)", "a (1)", "b", "plan with gains (1)"]
 
 
 def test_what_cannot_be_compared_is_refused(quick):

@@ -20,6 +20,7 @@ from agents.suite import Score, Suite, SuiteError, SuiteRun, list_suites, load_s
 from agents.suite.running import _from_files, _missing, entrant_names
 from agents.suite.suite_page import check, check_columns, comparable, overall_rows, suite_page
 from agents.zoo.finding import PolicyError
+from agents.zoo.shelf import load_policy
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.console import UNUSABLE
 from dq_space_arm_env.common.tables import tabulate
@@ -106,9 +107,14 @@ def test_unknown_names_are_refused(content):
         (["a=x.npz", "a=y.npz"], {}),
         (["one/b.yaml", "two/b.yaml"], {}),
         (["tiny"], {"tiny": still}),
+        (["zoo"], {"apg (zoo)": still}),  # they would count as trainings of one agent
     ):
         with pytest.raises(SuiteError, match="two are named"):
             run_suite(entrants, suite, policies=policies)
+    with pytest.raises(SuiteError, match=r"zoo=mine\.npz: zoo is the policies that ship"):
+        run_suite(["zoo=mine.npz"], suite)
+    with pytest.raises(PolicyError, match="apg maps 24 observations to 12 inputs"):
+        run_suite(["tiny"], suite, policies={"apg": lambda scene: load_policy("apg")})  # and trains nothing
     with pytest.raises(ConfigurationError, match=r"algorithm\.name"):
         Suite.model_validate({**content, "agents": {"tiny": {}}}).training(
             "tiny", next(iter(content["tasks"]))
