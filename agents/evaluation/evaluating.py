@@ -196,12 +196,15 @@ class Evaluation:
             optimal = OptimalCosts(
                 seeds, from_json_list(cost), from_json_list(success, np.bool_), from_json_list(seconds)
             )
+        flights = Flights.from_columns(episodes)
+        if not seeds.size or any(len(column) != len(seeds) for column in (flights.cost, *(optimal or ()))):
+            raise ValueError("columns of episodes are empty, or have different lengths")
         return cls(
             policy=str(summary["policy"]),
             scene=str(summary["scene"]),
             condition=str(summary["condition"]),
             seeds=seeds,
-            flights=Flights.from_columns(episodes),
+            flights=flights,
             optimal=optimal,
             action_seconds=float(summary["action_seconds"]),
             wall_seconds=float(summary["wall_seconds"]),

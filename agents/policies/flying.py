@@ -66,11 +66,14 @@ class Flights(NamedTuple):
 
     @classmethod
     def from_columns(cls, columns: Mapping[str, Sequence[Any]]) -> Self:
-        """Outcomes that `columns` has written; other columns may stand beside them."""
+        """Outcomes that `columns` has written, ValueError for others; more columns may stand beside them."""
         kinds = {"is_success": np.bool_, "diverged": np.bool_, "policy_failed": np.bool_, "length": np.int64}
         unknown = {"constraint_violations": [None] * len(columns["cost"])}  # in records of earlier versions
         found = {**unknown, **columns}
-        return cls(**{name: from_json_list(found[name], kinds.get(name)) for name in cls._fields})
+        flights = cls(**{name: from_json_list(found[name], kinds.get(name)) for name in cls._fields})
+        if any(values.shape != (len(flights.cost),) for values in flights):
+            raise ValueError("columns of flights have different lengths")
+        return flights
 
 
 def fly(
@@ -126,5 +129,7 @@ def json_list(values: NDArray[Any]) -> list[Any]:
 
 
 def from_json_list(values: Sequence[Any], kind: Any = None) -> NDArray[Any]:
-    """An array that `json_list` has written, NaN for None; of floats by default."""
+    """An array that `json_list` has written, NaN for None; of floats by default. ValueError for others."""
+    if kind is np.bool_ and not all(isinstance(value, bool) for value in values):
+        raise ValueError("flags are neither true nor false")  # NaN would count as true
     return np.array([np.nan if value is None else value for value in values], dtype=kind or np.float64)

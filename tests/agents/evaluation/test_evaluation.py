@@ -18,7 +18,7 @@ from agents.evaluation.evaluation_verbs import evaluate_policies
 from agents.evaluation.expert_costs import KIND, OptimalCosts, cost_rows
 from agents.evaluation.statistics import wilson_interval
 from agents.policies import ExportedPolicy
-from agents.policies.flying import time_per_action
+from agents.policies.flying import Flights, time_per_action
 from agents.suite import load_suite, run_suite
 from agents.zoo.finding import PolicyError, as_policy, check_fit
 from dq_space_arm_env import compile_scene, load_scene
@@ -455,6 +455,31 @@ def test_records_give_evaluations_back(cache, quick):
     assert again.summary() == evaluation.summary()
     for old, new in zip(evaluation.flights, again.flights, strict=True):
         np.testing.assert_array_equal(new, old)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"is_success": [None] * 3},
+        {"is_success": ["no"] * 3},
+        {"expert_success": [None] * 3},
+        {"is_success": [True]},
+        {"cost": [1.0]},
+        {"cost": [[1.0]] * 3},
+        {"expert_cost": [1.0]},
+        {"seed": [1, 2]},
+        {key: [] for key in (*Flights._fields, "seed", "expert_cost", "expert_success", "expert_seconds")},
+    ],
+    ids=str,
+)
+def test_records_whose_columns_do_not_fit_are_no_results(change):
+    """Neither NaN nor a text is a success, and one flight is not that of all starts."""
+    plain = evaluate(gentle, SHORT, 3, expert=False)
+    optimal = OptimalCosts(plain.seeds, np.ones(3), np.ones(3, bool), np.zeros(3))
+    record = dataclasses.replace(plain, optimal=optimal).record()
+    assert Evaluation.from_record(record).summary()["success_rate"][0] == 0.0
+    with pytest.raises(ValueError, match=r"neither true nor false|different lengths"):
+        Evaluation.from_record({**record, "episodes": {**record["episodes"], **change}})
 
 
 def test_the_command_writes_a_table_json_and_every_episode(tmp_path, capsys):
