@@ -91,6 +91,7 @@ class Score:
             "success_rate": list(self.success_rate),
             "interquartile_mean_cost_gap": known_interval(self.cost_gap),
             "tail": None if np.isnan(tails).all() else float(np.nanpercentile(tails, 95.0)),
+            "unknown_optima": summaries[0]["unknown_optima"],  # starts that gaps and profiles leave out
             "violating_episodes": None if self.violating is None else list(self.violating),
             "action_seconds": float(np.median([each["action_seconds"] for each in summaries])),
             "planning_seconds": self.rows[0].facts["planning_seconds"],

@@ -251,6 +251,13 @@ def _tasks(run: SuiteRun) -> Section:
         own = [record for record in records if record["task"] == task]
         if own:
             section.tables.append(tabulate(f"{task}\n{description}", own, _SCORES))
+        lacking = (
+            f"{task}, {each['condition']}: {each['unknown_optima']} of {each['episodes']} starts have no "
+            "cost gap and count in no profile, because the expert found no optimum there."
+            for each in own
+            if each["unknown_optima"]
+        )
+        section.notes += dict.fromkeys(lacking)  # the same for all who fly from the same starts
     section.record |= {"suite": run.suite.model_dump(mode="json"), "scores": json_value(records)}
     return section
 

@@ -186,6 +186,18 @@ def test_a_file_that_judges_by_other_limits_or_leaves_scores_out_is_refused(cont
     refused("mine flew in .*, but not under push", scores=record["scores"][:1])
 
 
+def test_the_page_tells_of_starts_without_an_optimum(content):
+    """A gap over half of the starts reads like one over all of them."""
+    few, all_known = [[0.01, 0.02, math.nan, math.nan]], [[0.01, 0.02, 0.03, 0.04]]
+    scores = (
+        made([[True] * 4], gaps, entrant=name)
+        for name, gaps in zip("xyz", (all_known, few, few), strict=True)
+    )
+    page = suite_page(SuiteRun(Suite.model_validate(content), (*scores,), {"a": ""}, ()), picture=False)
+    assert [row["unknown_optima"] for row in page.record["parts"]["tasks"]["scores"]] == [0, 2, 2]
+    assert page.markdown().count("a, training: 2 of 4 starts have no cost gap and count in no profile") == 1
+
+
 def test_scores_of_one_flight_are_compared_without_an_interval_of_the_gap(content, tmp_path):
     suite, file = Suite.model_validate(content), tmp_path / "theirs.json"
     run, other = (SuiteRun(suite, (made([[True]], [[gap]]),), {"a": ""}, ()) for gap in (0.01, 0.02))
