@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 _TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
 
-_PLACE = re.compile(rb"\x08location\x12([\x01-\x7f])", re.DOTALL)  # and the length of the name that follows
+# And the length of the name that follows, seven bits a byte, the lowest first.
+_PLACE = re.compile(rb"\x08location\x12([\x80-\xff]?)([\x01-\x7f])", re.DOTALL)
 
 
 class OnnxModelError(ValueError):
@@ -87,6 +88,10 @@ class OnnxModel:
 def tensor_files(path: Path) -> list[Path]:
     """Files that hold tensors of a network outside of its own, as PyTorch writes them; sorted."""
     content = path.read_bytes()
-    names = {content[each.end() : each.end() + each[1][0]] for each in _PLACE.finditer(content)}
+    names = {content[each.end() : each.end() + _length(*each.groups())] for each in _PLACE.finditer(content)}
     places = (path.parent / os.fsdecode(name) for name in names if b"\0" not in name)
-    return sorted(place for place in places if place.is_file())
+    return sorted(place for place in places if os.path.isfile(place))  # noqa: PTH113 - False for any name
+
+
+def _length(low: bytes, high: bytes) -> int:
+    return (low[0] & 0x7F) + 128 * high[0] if low else high[0]

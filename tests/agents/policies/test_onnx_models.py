@@ -113,9 +113,12 @@ def test_a_network_of_open_sizes_that_does_not_fit_the_scene_fails_in_a_sentence
         evaluate(file, small_scene, 1, expert=False)
 
 
-def test_tensors_outside_of_the_file_belong_to_the_policy_of_a_kept_row(tmp_path, small_scene, monkeypatch):
+@pytest.mark.parametrize("name", ["net", "n" * 150])  # whose length takes one byte or two
+def test_tensors_outside_of_the_file_belong_to_the_policy_of_a_kept_row(
+    tmp_path, small_scene, monkeypatch, name
+):
     """PyTorch writes them beside it, and the file itself is the same after another training."""
-    file, flown = tmp_path / "net.onnx", []
+    file, flown = tmp_path / f"{name}.onnx", []
     size = DQSpaceArmVectorEnv(1, small_scene).single_observation_space.shape[0]
 
     def fly(policy, scene, n, **options):
