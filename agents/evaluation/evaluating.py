@@ -112,7 +112,9 @@ class Evaluation:
     @cached_property
     def tail_cost_gap(self) -> Interval:
         """95th percentile of the known cost gaps, with a bootstrap interval."""
-        return bootstrap_interval(self._known_gaps, lambda gaps: float(np.percentile(gaps, TAIL)))
+        return bootstrap_interval(
+            self._known_gaps, lambda gaps: float(np.percentile(gaps, TAIL)), share=TAIL / 100.0
+        )
 
     @cached_property
     def violating_episodes(self) -> Interval:

@@ -12,6 +12,7 @@ Policies must be evaluated without SciPy, a hundred megabytes for a few formulas
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +33,7 @@ _NORMAL_QUANTILE = 1.959963984540054  # of CONFIDENCE, two-sided
 
 
 class Interval(NamedTuple):
-    """An estimate and its 95 % confidence interval; its bounds are NaN where a single value tells none."""
+    """An estimate and its 95 % confidence interval; its bounds are NaN where too few values tell none."""
 
     value: float
     low: float
@@ -62,17 +63,27 @@ def _score_interval(rate: float, n: float, z: float) -> Interval:
 
 
 def bootstrap_interval(
-    values: ArrayLike, statistic: Callable[[FloatArray], float], *, seed: int = 0
+    values: ArrayLike, statistic: Callable[[FloatArray], float], *, share: float = 0.5, seed: int = 0
 ) -> Interval:
-    """Percentile bootstrap of a statistic of independent values; NaN without values, and bounds of one."""
+    """Percentile bootstrap of a statistic of independent values; NaN without values.
+
+    The statistic has a share of the distribution below it. No bootstrap leaves the range of the values, which
+    holds it in 95 % of all samples from `fewest_values` on; bounds are NaN before.
+    """
     sample = np.asarray(values, dtype=np.float64)
-    if sample.size < 2:  # every resample of a single value is this value
+    if sample.size < fewest_values(share):
         return Interval(statistic(sample) if sample.size else math.nan, math.nan, math.nan)
     rng = np.random.default_rng(seed)
     resamples = [statistic(sample[rng.integers(len(sample), size=len(sample))]) for _ in range(RESAMPLES)]
     tail = 50.0 * (1.0 - CONFIDENCE)
     low, high = np.percentile(resamples, [tail, 100.0 - tail])
     return Interval(statistic(sample), float(low), float(high))
+
+
+def fewest_values(share: float) -> int:
+    """Number of values whose range holds a quantile in 95 % of all samples: 6 for the median."""
+    # It does not where all values lie below the quantile, or all above it.
+    return next(n for n in count(1) if share**n + (1.0 - share) ** n <= 1.0 - CONFIDENCE)
 
 
 def interquartile_mean(values: ArrayLike) -> float:

@@ -16,7 +16,7 @@ from agents.evaluation import (
     rate_over_runs,
     wilson_interval,
 )
-from agents.evaluation.statistics import gap_over_runs, student_quantile
+from agents.evaluation.statistics import fewest_values, gap_over_runs, student_quantile
 
 
 def test_wilsons_interval_of_a_half():
@@ -172,6 +172,19 @@ def test_a_single_value_tells_no_interval():
     for found in (bootstrap_interval([0.2], np.median), *map(gap_over_runs, ([[0.2]], [[math.nan, 0.2]]))):
         assert found == unknown
     assert gap_over_runs([[0.2], [0.3]]).low < 0.2
+
+
+def test_values_whose_range_holds_a_quantile_too_rarely_tell_no_interval():
+    """The range of 5 values holds the median in 1 - 2 / 2^5 = 94 %, of 58 the 95th percentile in 94.9 %."""
+    assert (fewest_values(0.5), fewest_values(0.95)) == (6, 59)
+    for share, fewest in ((0.5, 6), (0.95, 59)):
+        few, enough = (
+            bootstrap_interval(np.arange(n), lambda each, q=share: float(np.quantile(each, q)), share=share)
+            for n in (fewest - 1, fewest)
+        )
+        assert math.isnan(few.low)
+        assert math.isnan(few.high)
+        assert 0.0 <= enough.low < enough.value < enough.high <= fewest - 1
 
 
 def test_impossible_counts_and_too_few_or_unequal_runs_are_refused():
