@@ -111,8 +111,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | 20-22 | rates of joints 1 to 3                                                | -1e6 | 1e6 | rad/s |
     | 23    | time left in the episode                                              | 0    | T   | s     |
 
-    q_{D/G} and -q_{D/G} are the same pose: the sign is chosen at reset such that the scalar part is not negative, and carried along by continuity, as in
-    the cost. The observation determines the state; in a planar scene the error has only the four entries that are not identically zero.
+    q_{X/Y} is the pose of X with respect to Y, * conjugates; I is the inertial frame, G the tip, D the target. q_{D/G} and -q_{D/G} are the same pose:
+    the sign is chosen at reset such that the scalar part is not negative, and carried along by continuity, as in the cost. The observation determines the
+    state; in a planar scene the error has only the four entries that are not identically zero.
 
     Where the target moves, two twists stand before the time left, in tip axes, with the wrist held (in a planar scene three entries each; bounds are 1e12):
 
@@ -209,7 +210,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     | Parameter     | Type                     | Default   | Description                                            |
     |---------------|--------------------------|-----------|--------------------------------------------------------|
-    | `scene`       | **str, Path or Scene**   | `"paper"` | name of a shipped scene, path of a YAML file, its content as a mapping, or a `Scene` |
+    | `scene`       | **str, Path, dict or Scene** | `"paper"` | name of a shipped scene, path of a YAML file, its content as a mapping, or a `Scene` |
     | `render_mode` | **str or None**          | `None`    | `"rgb_array"`, or `"human"` for a window, which needs a display and the extra `render` |
     | `width`, `height` | **int**              | 640, 480  | size of the pictures, pixels                           |
     | `default_camera_config` | **dict or None** | `None`  | camera placement as in Gymnasium's MuJoCo environments: any of `azimuth`, `elevation` (viewing direction, deg; negative elevations look down), `lookat` (point in the center of the picture, m) and `distance` from it (m); defaults keep start, target and the arm between them in view |

@@ -105,7 +105,7 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
 
     | Parameter     | Type                     | Default           | Description                                             |
     |---------------|--------------------------|-------------------|---------------------------------------------------------|
-    | `scene`       | **str, Path or Scene**   | `"random-target"` | name of a shipped scene, path of a YAML file, its content as a mapping, or a `Scene` |
+    | `scene`       | **str, Path, dict or Scene** | `"random-target"` | name of a shipped scene, path of a YAML file, its content as a mapping, or a `Scene` |
     | `reward_type` | **str**                  | `"sparse"`        | `"sparse"` or `"dense"`                                 |
     | `render_mode`, `width`, `height`, `default_camera_config` | | | as in `DQSpaceArm-v0`                         |
 
