@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from agents.zoo import list_policies
+from agents.zoo.shelf import policy_file
 from dq_space_arm_env.command_line import main
 from scripts import reproduce_paper
 
@@ -33,6 +35,17 @@ def test_examples_in_the_docstrings_of_environments_run(name):
     results = doctest.testmod(import_module(f"dq_space_arm_env.environment.{name}"))
     assert results.attempted >= 5
     assert results.failed == 0
+
+
+def test_its_table_of_agents_says_what_the_cards_of_the_zoo_say():
+    row = r"^\| `([\w-]+)` \| [^|]+ \| ([\d.]+) \[([\d.]+), ([\d.]+)\] \| ([\d.]+) \|"
+    shown = {name: [float(each) for each in cells] for name, *cells in re.findall(row, README, re.MULTILINE)}
+    for name in set(list_policies()) & shown.keys():
+        card = policy_file(name).with_suffix(".md").read_text(encoding="utf-8")
+        line = re.search(r"\| as in training \| ([\d.]+) \[([\d.]+), ([\d.]+)\] \| ([\d.]+) ", card)
+        *success, gap = map(float, line.groups())
+        assert shown[name] == [*success, round(gap, 2)], name
+    assert len(set(list_policies()) & shown.keys()) == 5
 
 
 @pytest.mark.slow
