@@ -152,6 +152,11 @@ class Episodes:
             self._inner[max(first - 2, 0) : first] = 0.0
         self._arrivals = arrivals(times, dt, firsts, count)
 
+    def follow_on(self, others: Episodes) -> None:
+        """Take the penalties that others of the same scene have come to."""
+        self.roughness = others.roughness
+        self.penalties.prices[:], self.penalties.cost = others.penalties.prices, others.penalties.cost
+
     def divide(self, substeps: Array) -> None:
         """Divide decisions into equal integration steps, (K,), that hold the input."""
         self.substeps = substeps

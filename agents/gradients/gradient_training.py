@@ -21,11 +21,11 @@ from threadpoolctl import threadpool_limits
 from agents.configuration.gradients import GradientConfiguration
 from agents.gradients.disturbed_flights import Met, calm
 from agents.gradients.episodes import Episodes, decision_times
-from agents.gradients.layers import FIRST_OUTPUTS, Layers, random_weights
+from agents.gradients.first_units import first_units
+from agents.gradients.layers import Layers, random_weights
 from agents.gradients.soap import SOAP
-from agents.gradients.starts import Starts, motions
+from agents.gradients.starts import Starts
 from agents.policies import ExportedPolicy
-from agents.policies.exported import units_of
 from agents.run_folder import (
     POLICY,
     DivergedError,
@@ -35,30 +35,23 @@ from agents.run_folder import (
     validation_seeds,
 )
 from agents.zoo.starting import load_start, spent_before
-from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, load_scene
+from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.common.bounded_formats import ARRAY_BYTES, read_arrays
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Advance, Status
 from dq_space_arm_env.scene import INTEGRATORS, StateLayout
-from dq_space_arm_env.task.step_report import STATE_LIMIT
 
 Array = NDArray[Any]
 
 WARM_UP = 50  # updates in which the learning rate rises
 FINAL_RATE = 3e-3  # learning rate at the end, relative to its peak
-FIRST_UNITS = 0.1  # of the network's outputs, fractions of the limits
 UNITS_PER_SIZE = 4.0  # units that they become, relative to the root mean square of the inputs
 FASTEST_UNITS = 1.03  # largest factor by which units change in an update
 TRAVELLED = 0.3  # share of the updates after which missing the tolerances has a price
 MISSING = 0.25  # share of episodes that miss them, up to which the end weight falls
 LIGHTER = 1.01  # factor of its fall in an update
-TRIAL_ACTIONS = 0.005  # standard deviation of the actions that measure the spread of observations
 COARSE = 1e-4  # tolerance of methods that adapt their steps, rad and m; at least the scene's
-PART = 0.1  # least deviation of an observation, of that in motions over a radian or a meter
-TINY = 1e-12  # motion [rad, m] that is none
-SEEN = 128  # episodes of that
-FARTHEST = 5.0  # motion [rad, m] by the first outputs over an episode; units are smaller beyond
 WORSE = 2.0  # median cost relative to recent ones, above which the weights go back to what they were
 DRIFTED = 1.5  # likewise of recent costs, relative to those with the weights to go back to
 WORTHY = 1.2  # likewise, up to which newer weights take their place
@@ -70,6 +63,8 @@ BETWEEN_COPIES = 50  # updates between copies of the weights; those to go back t
 MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives up
 CAUTION = 0.7  # factor of the learning rate when they do
 RECOVERY = 1.001  # factor by which it comes back in an update
+EVERY_STEP = 0.9  # share of the updates after which constrained episodes decide at every time step
+LAST_STARTS = 2048  # starts that they are drawn from then
 BETWEEN_DIVISIONS = 20  # updates between measurements of the integration's errors
 TOLERATED = 1e-3  # share of the cost by which the integration may change it, over all decisions
 BETWEEN_MESSAGES = 20  # updates
@@ -122,16 +117,14 @@ class _Learner:
         factors = (1.0,) if mismatch is None else mismatch.mass_factors
         drawn = Starts.draw(scene, settings.starts, self._times, configuration.seed, factors)
         self._flown, self._starts = drawn
-        moved = motions(scene, FIRST_UNITS * FIRST_OUTPUTS)
-        units = FIRST_UNITS * FARTHEST / np.maximum(moved, FARTHEST)
-        self._mean, self._scale = self._normalization(DQSpaceArmVectorEnv(SEEN, scene), rng, units, moved)
+        self._mean, self._scale, units = first_units(scene, self._times, rng, configuration.seed)
         sizes = [len(self._mean), *configuration.network.hidden, StateLayout.of(scene).n_u]
         self._weights = random_weights(sizes, rng)
         start = load_start(configuration.start_from, configuration.network, sizes[0], sizes[-1])
         self._begin_with(start, units)
-        layers = Layers(self._weights, len(self._times) - 1, settings.copies)
-        noisy = mismatch is not None and mismatch.noise > 0.0
-        self._episodes = Episodes(coarser(self._flown), layers, self._times, units, noisy=noisy)
+        self._episodes = self._begin_episodes(units)
+        becomes_finer = self._episodes.penalties.is_constrained and len(self._times) <= scene.simulation.steps
+        self._every_step_from = math.ceil(EVERY_STEP * settings.updates) if becomes_finer else math.inf
         self._optimizer = SOAP(self._weights)
         self._updates, self._seconds = 0, 0.0
         self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
@@ -139,6 +132,29 @@ class _Learner:
         self._end_weight = settings.end_weight
         self._missing = 1.0  # share of recent episodes that miss the tolerances
         self._kept, self._newer = self._state(), self._state()
+
+    def _begin_episodes(self, units: Array) -> Episodes:
+        """Episodes that decide at the present times."""
+        mismatch = self._mismatch
+        layers = Layers(self._weights, len(self._times) - 1, self._settings.copies)
+        noisy = mismatch is not None and mismatch.noise > 0.0
+        return Episodes(coarser(self._flown), layers, self._times, units, noisy=noisy)
+
+    def _decide_at_every_step(self) -> None:
+        """Go on as in flight: what violates a constraint for a moment may do so between decisions."""
+        simulation, before = self._scene.simulation, self._episodes
+        self._times = simulation.dt * np.arange(simulation.steps + 1)
+        states, parameters = (each[:LAST_STARTS] for each in self._starts[:2])
+        self._starts = Starts.of(compile_scene(self._flown), states, parameters, self._times)
+        self._episodes = self._begin_episodes(before.units)
+        self._episodes.follow_on(before)
+        self._forget_costs()
+
+    def _forget_costs(self) -> None:
+        """Begin with recent costs anew: the same motions have others now."""
+        self._typical = math.inf
+        for copy in (self._kept, self._newer):
+            copy["typical"][...] = math.inf
 
     def _begin_with(self, policy: ExportedPolicy | None, units: Array) -> None:
         """Take the weights of a policy, and its units; outputs have some of their own."""
@@ -152,43 +168,6 @@ class _Learner:
             self._weights[2 * index : 2 * index + 2] = [
                 np.asarray(each * last, np.float32) for each in (weight, bias)
             ]
-
-    def _normalization(
-        self, environment: DQSpaceArmVectorEnv, rng: np.random.Generator, units: Array, moved: Array
-    ) -> tuple[Array, Array]:
-        """Mean and inverse deviation of observations, (n_obs,).
-
-        Those under small random inputs; but where a motion over a radian or a meter varies an entry much
-        more, as velocities that friction keeps small otherwise, a part of that.
-        """
-        environment.reset(seed=int(rng.integers(2**31)))
-        shape, turn = (len(self._times) - 1, SEEN, len(units)), len(self._times) // 2
-        limit = environment.kernels.layout.control_limit
-        small = TRIAL_ACTIONS * (units / FIRST_UNITS) * limit * rng.normal(size=shape)
-        mean, scale = units_of(self._trial(environment, small))
-        # There and back, as far as the limits allow.
-        far = limit * np.minimum(FIRST_UNITS * FIRST_OUTPUTS / np.maximum(moved, TINY), 1.0)
-        shares = np.random.default_rng(self._configuration.seed).uniform(-1.0, 1.0, shape[1:])
-        far = np.repeat((far * shares)[None], shape[0], axis=0)
-        far[turn:] *= -1.0
-        most = units_of(self._trial(environment, far))[1]
-        return mean, np.where(most > 0.0, np.minimum(scale, most / PART), scale)
-
-    def _trial(self, environment: DQSpaceArmVectorEnv, inputs: Array) -> Array:
-        """Observations (N, n_obs) under inputs (K, B, n_u), those of flights that have not diverged."""
-        kernels, states, seen = environment.kernels, environment.states, []
-        given = environment.parameters if kernels.n_p else None
-        stages = None  # a target that moves stands at its start: its motion would count as spread
-        if kernels.parameters.staged:
-            along = Starts.of(kernels, states, environment.parameters, self._times)
-            stages = along.at(np.arange(SEEN))
-        for k, step in enumerate(np.diff(self._times)):
-            left = np.full((SEEN, 1), self._times[-1] - self._times[k])
-            p = given if stages is None else stages[k]
-            seen.append(kernels.observation(states, left, p)[0])
-            states = kernels.step(states, inputs[k], step, p=p)
-        samples = np.concatenate(seen)
-        return np.asarray(samples[(np.abs(samples) < STATE_LIMIT).all(axis=1)])  # false for NaN
 
     def learn(self, folder: RunFolder, report: Callable[[Advance], None]) -> None:
         """Update to the end; flights and checkpoints on the way."""
@@ -216,6 +195,8 @@ class _Learner:
     def _update(self) -> float:
         """Fly episodes, take a step, and return their median cost."""
         settings, done = self._settings, self._updates
+        if done == self._every_step_from:
+            self._decide_at_every_step()
         # Seeded by the update, so that checkpoints need no generator's state.
         rng = np.random.default_rng([self._configuration.seed, done])
         rows = rng.integers(len(self._starts.states), size=settings.copies)
@@ -278,9 +259,7 @@ class _Learner:
         if not wrong.any():
             return False
         episodes.divide(np.where(wrong, np.minimum(2 * episodes.substeps, most), episodes.substeps))
-        self._typical = math.inf  # costs are others now
-        for copy in (self._kept, self._newer):
-            copy["typical"][...] = math.inf
+        self._forget_costs()
         return True
 
     def _follow(self, gradient: Sequence[Array], median: float) -> None:
@@ -323,9 +302,12 @@ class _Learner:
 
     def effort(self) -> dict[str, Any]:
         """What the training has taken; an environment step is one between decisions."""
-        steps = self._updates * self._settings.copies * self._settings.decisions
+        at_every_step = max(0, self._updates - self._every_step_from)
+        decided = (self._updates - at_every_step) * self._settings.decisions
+        decided += at_every_step * self._scene.simulation.steps
         solves, seconds = self._before
         spent = {"expert_solves": solves, "seconds": round(seconds + self._seconds, 3)}
+        steps = decided * self._settings.copies
         return {"environment_steps": steps, "updates": self._updates, **spent}
 
     def export(self, metadata: dict[str, Any]) -> ExportedPolicy:
@@ -378,6 +360,8 @@ class _Learner:
         place = folder.checkpoint()
         if place is None:
             return
+        if int(place.name) > self._every_step_from:
+            self._decide_at_every_step()
         try:
             expected = sum(8 * each.size for each in self._everything().values())
             arrays = read_arrays(place / CHECKPOINT, most=expected + ARRAY_BYTES)

@@ -37,7 +37,7 @@ class _Ascent(NamedTuple):
 
 
 # Flights between decisions keep within their tolerances; rows share what is allowed.
-ALONG = _Ascent(charged=0.5, near=-5.0, allowed=0.005, most=0.1, fastest=0.05, dearest=1e3)
+ALONG = _Ascent(charged=0.5, near=-5.0, allowed=0.01, most=0.1, fastest=0.05, dearest=1e3)
 FEWER = 0.2  # factor by which the most of them becomes less as penalties become stiffer
 # An error of e tolerances violates by (e^2 - 1) / 2: those above 0.93 count, and all are near.
 AT_END = _Ascent(charged=-0.07, near=-1.0, allowed=0.002, most=0.04, fastest=0.04, dearest=6.0)

@@ -15,8 +15,6 @@ from dq_space_arm_env.scene.parameters import CATCH
 
 Array = NDArray[Any]
 
-SMALLER = 0.01  # inputs relative to the first ones, by which their motions are measured
-
 
 class Starts(NamedTuple):
     """States (n, n_x) that episodes begin at, and parameters of each decision and the end.
@@ -67,19 +65,3 @@ class Starts(NamedTuple):
             found[:, :, own] = moving[:, rows]
         found[:, :, alike] = staged
         return found
-
-
-def motions(scene: Scene, share: float) -> Array:
-    """How far each input, at a share of its limit, moves something, (n_u,).
-
-    Largest motion of base, joints and wrist over an episode, rad and m; by much smaller inputs, linearly.
-    """
-    kernels = compile_scene(scene)
-    small = SMALLER * share * np.diag(kernels.layout.control_limit)
-    inputs = np.vstack([small, np.zeros_like(small[:1])])
-    states = np.repeat(kernels.layout.initial_state[None], len(inputs), axis=0)
-    for _ in range(scene.simulation.steps):
-        states = kernels.step(states, inputs, scene.simulation.dt)
-    entries = kernels.layout.state
-    moved = np.abs(states[:-1] - states[-1])[:, : entries.base_velocity.start]
-    return np.asarray(moved.max(axis=1) / SMALLER)

@@ -267,7 +267,7 @@ def test_prices_rise_where_an_episode_violates(limited):
 
     def factors(with_prices, most=0.1):
         """One rises by up to 5 %, falls slowly where episodes come near, and else as fast as it rises."""
-        allowed = 0.005 / max(1, with_prices)
+        allowed = 0.01 / max(1, with_prices)
         rises = np.minimum(violating, most) - allowed
         falls_fast = most - np.minimum(near, most)
         return np.exp(0.05 / most * (rises - falls_fast * (most - allowed) / most))

@@ -10,9 +10,9 @@ pytest.importorskip("threadpoolctl")
 from agents.configuration import ConfigurationError, load_configuration
 from agents.configuration.gradients import FlightMismatch
 from agents.configuration.schema import Network
-from agents.gradients import gradient_training
+from agents.gradients import first_units, gradient_training
+from agents.gradients.first_units import motions
 from agents.gradients.gradient_training import train_by_gradients
-from agents.gradients.starts import motions
 from agents.run_folder import RunFolder, RunFolderError, validation_seeds
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene
 from dq_space_arm_env.environment.rollouts import rollout
@@ -50,6 +50,30 @@ def test_decisions_are_divided_where_the_integration_errs(small_file, small_scen
     assert substeps.min() < substeps.max()
     errs = errors > 1e-9 * learner._fly(starts)[1] / len(errors)
     np.testing.assert_array_equal(substeps[errs], most[errs])
+
+
+def test_constrained_episodes_decide_at_every_time_step_at_last(limited, small_file, small_scene):
+    """What violates a constraint for a moment may do so between decisions."""
+    free, learner = (
+        gradient_training._Learner(settings(small_file, updates=20), each) for each in (small_scene, limited)
+    )
+    for _ in range(18):
+        free._update()
+        learner._update()
+    assert len(learner._times) == 41
+    prices, units = (each.copy() for each in (learner._episodes.penalties.prices, learner._episodes.units))
+    learner._adapt = lambda: None  # or they change
+    weights = learner._weights[0].copy()
+    learner._update()
+    free._update()
+    dt, steps = limited.simulation.dt, limited.simulation.steps
+    np.testing.assert_array_equal(learner._times, dt * np.arange(steps + 1))
+    np.testing.assert_array_equal(learner._episodes.penalties.prices, prices)
+    np.testing.assert_array_equal(learner._episodes.units, units)
+    assert not np.array_equal(learner._weights[0], weights)
+    assert learner.effort()["environment_steps"] == 16 * (18 * 40 + steps)
+    assert len(free._times) == 41
+    assert free.effort()["environment_steps"] == 16 * 19 * 40
 
 
 def settings(small_file, **algorithm):
@@ -104,16 +128,21 @@ def resume_after(updates, configuration, folder, monkeypatch):
 def test_constraints_are_learned_and_prices_resumed(limited, small_file, tmp_path, monkeypatch):
     limited.to_yaml(tmp_path / "limited.yaml")
     constrained = settings(tmp_path / "limited.yaml")
+    often = constrained.progression.model_copy(update={"checkpoint_every": 38})
+    constrained = constrained.model_copy(update={"progression": often})
     trained = train_by_gradients(constrained, tmp_path / "whole")
-    resumed = resume_after(77, constrained, tmp_path / "halves", monkeypatch)
-    for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
-        np.testing.assert_array_equal(one, other)
     prices = []
-    for folder in ("whole", "halves"):
+    for folder, updates in (("whole", 0), ("before", 77), ("amid", 117)):  # of the last, at every time step
+        if updates:
+            resumed = resume_after(updates, constrained, tmp_path / folder, monkeypatch)
+            for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
+                np.testing.assert_array_equal(one, other)
         last = max((tmp_path / folder / "checkpoints").glob("*/checkpoint.npz"))
         with np.load(last) as arrays:
             prices.append(arrays["prices"])
-    np.testing.assert_array_equal(*prices)
+            assert len(arrays["substeps"]) == limited.simulation.steps
+    for each in prices[1:]:
+        np.testing.assert_array_equal(each, prices[0])
     unaware = train_by_gradients(settings(small_file), tmp_path / "unaware").policy
     policies = trained.policy, unaware
     violated = [rollout(each, limited, SEEDS).constraint_violations.mean() for each in policies]
@@ -140,7 +169,7 @@ def test_light_joints_have_small_units(small_file, small_scene):
     np.testing.assert_array_equal(plain._episodes.units, 0.1)
     joints = compile_scene(small_scene).layout.control.joint_torque
     moved = light._episodes.units[joints] / 0.1 * motions(strong, 1e-3)[joints]
-    np.testing.assert_allclose(moved, gradient_training.FARTHEST)
+    np.testing.assert_allclose(moved, first_units.FARTHEST)
     light._update()
     sizes = light._episodes.sizes()[joints]  # in the same proportions
     np.testing.assert_allclose(
@@ -155,7 +184,7 @@ def test_observations_that_small_inputs_hardly_vary_are_scaled_by_motions(
     links = [{**link.model_dump(exclude_none=True), "damping": 0.3} for link in small_scene.links]
     slow = small_scene.replace(links=links, spread={"joint_rates": 0})
     scale = gradient_training._Learner(settings(small_file, decisions=150), slow)._scale
-    monkeypatch.setattr(gradient_training, "PART", 1e-9)
+    monkeypatch.setattr(first_units, "PART", 1e-9)
     by_small_inputs = gradient_training._Learner(settings(small_file, decisions=150), slow)._scale
     relative, rates = scale / by_small_inputs, slice(-4, -2)  # of the first two joints
     assert (relative <= 1.0).all()
@@ -263,8 +292,13 @@ def test_training_starts_from_a_policy(small_file, tmp_path):
 def test_normalization_is_that_of_the_checkpoint(small_file, tmp_path, monkeypatch):
     """Weights belong to it; the policy that a training starts from may have been trained anew since."""
     first = resume_after(10, settings(small_file, updates=20), tmp_path, monkeypatch).policy
-    other = first.mean + 1.0, 2.0 * first.scale
-    monkeypatch.setattr(gradient_training._Learner, "_normalization", lambda *arguments: other)
+    measured = gradient_training.first_units
+
+    def others(*arguments):
+        mean, scale, outputs = measured(*arguments)
+        return mean + 1.0, 2.0 * scale, outputs
+
+    monkeypatch.setattr(gradient_training, "first_units", others)
     (tmp_path / "policy.npz").unlink()
     again = train_by_gradients(settings(small_file, updates=20), tmp_path).policy
     np.testing.assert_array_equal(again.mean, first.mean)
