@@ -38,15 +38,11 @@ class Chunks:
         self._observations = np.stack([each.observations[:-1].astype(np.float32) for each in demonstrations])
         self._actions = np.stack([each.actions.astype(np.float32) for each in demonstrations])
 
-    def batches(
-        self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool
-    ) -> Iterator[Batch]:
+    def batches(self, size: int, names: Sequence[str], *, seed: int) -> Iterator[Batch]:
         """One pass over all time steps; `actions` are of shape (B, k, n_u), the last repeats at the end."""
         maneuvers, horizon = self._actions.shape[:2]
-        order = np.arange(maneuvers * horizon)
-        if seed is not None:
-            order = np.random.default_rng(seed).permutation(order)
-        for first in range(0, len(order) - drop_last * (size - 1), size):
+        order = np.random.default_rng(seed).permutation(maneuvers * horizon)
+        for first in range(0, len(order), size):
             maneuver, stage = np.divmod(order[first : first + size], horizon)
             ahead = np.minimum(stage[:, None] + self._ahead, horizon - 1)
             arrays = {

@@ -1,5 +1,6 @@
 """Sources of training samples: demonstrations, labeled flights of a network, or a mixture."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -20,9 +21,7 @@ SPREAD_STAGES = 50  # at which the spread of demonstrations is measured
 class Source(Protocol):
     """Samples in batches, as `Demonstrations` offers them."""
 
-    def batches(
-        self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool
-    ) -> Iterator[Batch]:
+    def batches(self, size: int, names: Sequence[str], *, seed: int) -> Iterator[Batch]:
         """One pass over all time steps, see `Demonstrations.batches`."""
 
 
@@ -108,16 +107,10 @@ class Corrections:
         """Keep one time step in `every`."""
         return Corrections(*(getattr(self, name)[::every].copy() for name in COLUMNS))
 
-    def batches(
-        self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool
-    ) -> Iterator[Batch]:
-        order = np.arange(len(self))
-        if seed is not None:
-            order = np.random.default_rng(seed).permutation(order)
+    def batches(self, size: int, names: Sequence[str], *, seed: int) -> Iterator[Batch]:
+        order = np.random.default_rng(seed).permutation(len(self))
         for first in range(0, len(order), size):
             rows = order[first : first + size]
-            if len(rows) < size and drop_last:
-                return
             yield Batch(rows, np.zeros_like(rows), {name: getattr(self, name)[rows] for name in names})
 
 
@@ -129,12 +122,10 @@ class Mixture:
     second: Source
     share: float
 
-    def batches(
-        self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool
-    ) -> Iterator[Batch]:
+    def batches(self, size: int, names: Sequence[str], *, seed: int) -> Iterator[Batch]:
         other = min(max(1, round(self.share * size)), size - 1)
         second = self._endless(other, names, seed)
-        for batch in self.first.batches(size - other, names, seed=seed, drop_last=drop_last):
+        for batch in self.first.batches(size - other, names, seed=seed):
             more = next(second)
             yield Batch(
                 np.concatenate([batch.demonstration, more.demonstration]),
@@ -142,10 +133,6 @@ class Mixture:
                 {name: np.concatenate([batch.arrays[name], more.arrays[name]]) for name in names},
             )
 
-    def _endless(self, size: int, names: Sequence[str], seed: int | None) -> Iterator[Batch]:
-        turn = 0
-        while True:
-            yield from self.second.batches(
-                size, names, seed=None if seed is None else seed + turn, drop_last=False
-            )
-            turn += 1
+    def _endless(self, size: int, names: Sequence[str], seed: int) -> Iterator[Batch]:
+        for turn in itertools.count(seed):
+            yield from self.second.batches(size, names, seed=turn)

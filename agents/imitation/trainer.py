@@ -171,9 +171,7 @@ class Trainer(Generic[N]):
     def _rest_of_epoch(self, training: Source) -> Iterator[Any]:
         """The rest of one pass over the data, in an order seeded by the epoch."""
         order = int(np.random.SeedSequence([self._seed, self._epoch]).generate_state(1)[0])
-        batches = training.batches(
-            self._optimization.batch_size, self._objective.needs, seed=order, drop_last=False
-        )
+        batches = training.batches(self._optimization.batch_size, self._objective.needs, seed=order)
         done = self._position
         for position, batch in enumerate(batches):
             if position >= done:
@@ -228,7 +226,7 @@ class Trainer(Generic[N]):
         rows = []
         with torch.no_grad():
             batches = validation.batches(
-                self._optimization.batch_size, self._objective.needs, seed=self._seed, drop_last=False
+                self._optimization.batch_size, self._objective.needs, seed=self._seed
             )
             for _, batch in zip(range(VALIDATION_BATCHES), batches, strict=False):
                 losses = self._objective(self._network, batch, rng)
