@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from gymnasium import Wrapper, spaces
 from gymnasium.utils import EzPickle
-from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.wrappers.vector import RescaleAction
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.wrappers.vector import RepeatAction, ShapeReward
+from agents.wrappers.vector import RepeatAction, ShapeReward, chain
 from agents.wrappers.vector_infos import Info, single_infos
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
 
@@ -69,7 +69,7 @@ class SB3VecEnv(VecEnv):
                 "expect: give it to gymnasium.make_vec as autoreset_mode"
             )
         self.vector_env = vector_env
-        self._chain = _chain(vector_env)
+        self._chain = chain(vector_env)
         self._given = frozenset(name for env in self._chain for name in dir(env))
         self._repeater = next((env for env in reversed(self._chain) if isinstance(env, RepeatAction)), None)
         space = _in_single_precision(vector_env.single_observation_space)
@@ -349,11 +349,6 @@ class DQSpaceArmVecEnv(SB3VecEnv, EzPickle):
         native = DQSpaceArmVectorEnv(num_envs, scene, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
         EzPickle.__init__(self, num_envs, native.scene, seed, step_infos=step_infos, **kwargs)
         SB3VecEnv.__init__(self, native, seed, step_infos=step_infos)
-
-
-def _chain(env: VectorEnv[Any, Any, Any]) -> list[VectorEnv[Any, Any, Any]]:
-    """The environment with its wrappers, from the outermost in."""
-    return [env, *_chain(env.env)] if isinstance(env, VectorWrapper) else [env]
 
 
 def _noted_actions(chain: list[VectorEnv[Any, Any, Any]]) -> spaces.Space[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -16,6 +17,11 @@ from agents.wrappers.vector_infos import Info, Rows, merged, single_infos, with_
 Mask = NDArray[np.bool_]
 Result = tuple[Any, NDArray[Any], Mask, Mask, Info]
 Env = VectorEnv[Any, Any, Any]
+
+
+def chain(env: Env) -> list[Env]:
+    """A vector environment with its wrappers, from the outermost in."""
+    return [env, *chain(env.env)] if isinstance(env, VectorWrapper) else [env]
 
 
 class _Finished(NamedTuple):
@@ -74,7 +80,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         check_repeat(repeat, reward, discount)
         super().__init__(env)
         _check_restorable(env)
-        self._shaper = _innermost_shaper(env)
+        self._shaper = next((each for each in reversed(chain(env)) if isinstance(each, ShapeReward)), None)
         self.repeat, self.steps_taken = int(repeat), np.zeros(env.num_envs, dtype=np.int64)
         self.collected, self.largest_cost = np.zeros(env.num_envs), np.zeros(env.num_envs)
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
@@ -131,22 +137,12 @@ def _check_restorable(env: Env) -> None:
             f"{type(env.unwrapped).__name__} has no get_state(), which holding actions in it needs: wrap "
             "each of its environments in agents.wrappers.RepeatAction"
         )
-    while isinstance(env, VectorWrapper):
-        if not isinstance(env, VectorActionWrapper | VectorRewardWrapper | ShrinkActionSpace | ShapeReward):
+    for each in chain(env)[:-1]:
+        if not isinstance(each, VectorActionWrapper | VectorRewardWrapper | ShrinkActionSpace | ShapeReward):
             raise TypeError(
-                f"{type(env).__name__} inside RepeatAction would count the steps in which an episode that "
+                f"{type(each).__name__} inside RepeatAction would count the steps in which an episode that "
                 "has ended waits for the others: put it around RepeatAction"
             )
-        env = env.env
-
-
-def _innermost_shaper(env: Env) -> ShapeReward | None:
-    """The wrapper that shapes rewards first."""
-    found = None
-    while isinstance(env, VectorWrapper):
-        found = env if isinstance(env, ShapeReward) else found
-        env = env.env
-    return found
 
 
 def _constraint_cost(info: Info, over: Mask) -> Any:
@@ -245,7 +241,7 @@ class ShapeReward(VectorWrapper[Any, Any, Any, Any, Any]):
         self.unshaped = np.zeros(env.num_envs)
         self._shaping = Shaping.checked(
             getattr(env.unwrapped, "scene", None),
-            _held_steps(env),
+            math.prod(each.repeat for each in chain(env) if isinstance(each, RepeatAction)),
             scale=scale,
             power=power,
             success_reward=success_reward,
@@ -259,12 +255,3 @@ class ShapeReward(VectorWrapper[Any, Any, Any, Any, Any]):
         if self._shaping.counts_ends and (ended := terminated | truncated).any():
             shaped[ended] += self._shaping.of_ends(info.get("final_info", info))[ended]
         return observations, shaped, terminated, truncated, info
-
-
-def _held_steps(env: Env) -> int:
-    """Time steps of a decision."""
-    steps = 1
-    while isinstance(env, VectorWrapper):
-        steps *= env.repeat if isinstance(env, RepeatAction) else 1
-        env = env.env
-    return steps
