@@ -13,10 +13,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.configuration import Configuration
 from agents.policies import ExportedPolicy
-from agents.reinforcement.checkpoint import write_checkpoint
+from agents.reinforcement.checkpoint import Progress, write_checkpoint
 from agents.reinforcement.lagrangian import Lagrangian
 from agents.reinforcement.networks import export_policy
-from agents.reinforcement.training_progress import Progress
 from agents.run_folder import BEST, DivergedError, RunFolder, validate, validation_seeds
 from agents.zoo.finding import as_policy
 from dq_space_arm_env import Scene

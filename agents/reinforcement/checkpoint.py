@@ -16,7 +16,7 @@ import json
 import random
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,6 @@ from stable_baselines3.common.save_util import recursive_getattr
 
 from agents.policies.tensor_files import read_tensors
 from agents.reinforcement.sac import DemonstrationBuffer
-from agents.reinforcement.training_progress import Progress
 from agents.run_folder import RunFolderError
 from dq_space_arm_env.common.bounded_formats import read_arrays
 from dq_space_arm_env.common.bounded_reading import read_bytes, read_mapping
@@ -47,6 +46,15 @@ _COLUMNS = (
     "ep_start",
     "ep_length",
 )
+
+
+class Progress(NamedTuple):
+    """How far a run has come, and what it took."""
+
+    environment_steps: int = 0  # of all copies together
+    seconds: float = 0.0  # training time, over all starts of the run
+    expert_solves: int = 0  # for demonstrations, or for the policy it started from
+    seconds_before: float = 0.0  # time for these, and for training the policy it started from
 
 
 def write_checkpoint(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:

@@ -22,13 +22,12 @@ from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.policies import ExportedPolicy
 from agents.policies.exported import units_of
 from agents.reinforcement.callback import TimeIsUp, TrainingCallback
-from agents.reinforcement.checkpoint import read_checkpoint
+from agents.reinforcement.checkpoint import Progress, read_checkpoint
 from agents.reinforcement.networks import ACTIVATIONS, ScaledActionsPolicy, ScaledObservations
 from agents.reinforcement.off_policy import LAYER_NORMALIZED, TruncatedQuantileCritics, TwinDelayed
 from agents.reinforcement.ppo import ProximalPolicyOptimization
 from agents.reinforcement.sac import DemonstrationBuffer, SoftActorCritic
 from agents.reinforcement.training_environment import action_limits, make_environment
-from agents.reinforcement.training_progress import Progress
 from agents.reinforcement.warm_start import fly_again, set_actor
 from agents.run_folder import DEMONSTRATIONS, MODEL, POLICY, TENSORBOARD, RunFolder
 from agents.zoo.starting import load_start, spent_before

@@ -16,10 +16,10 @@ from agents.evaluation.plan_followers import follower
 from agents.evaluation.plans import Plans
 from agents.policies import ExportedPolicy
 from agents.reinforcement.callback import TrainingCallback
+from agents.reinforcement.checkpoint import Progress
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.reinforcement_training import Trained, make_learner, train_learner
 from agents.reinforcement.training_environment import held_environment, largest_actions
-from agents.reinforcement.training_progress import Progress
 from agents.residual.corrections import correction
 from agents.residual.environment import ResidualVectorEnv
 from agents.residual.mismatch import Worlds, fly_mismatched

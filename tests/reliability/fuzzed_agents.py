@@ -148,9 +148,8 @@ def checkpoints(folder: Path) -> Subject:
     """A checkpoint of a learner with a replay buffer."""
     pytest.importorskip("sb3_contrib")
     from agents.configuration import load_configuration
-    from agents.reinforcement.checkpoint import read_checkpoint, write_checkpoint
+    from agents.reinforcement.checkpoint import Progress, read_checkpoint, write_checkpoint
     from agents.reinforcement.reinforcement_training import make_environment, make_learner
-    from agents.reinforcement.training_progress import Progress
     from agents.run_folder import RunFolderError
 
     small_scene().to_yaml(folder / "small.yaml")

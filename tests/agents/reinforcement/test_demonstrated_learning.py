@@ -10,11 +10,10 @@ import torch
 
 from agents import ExportedPolicy
 from agents.configuration import load_configuration
-from agents.reinforcement.checkpoint import read_checkpoint, write_checkpoint
+from agents.reinforcement.checkpoint import Progress, read_checkpoint, write_checkpoint
 from agents.reinforcement.reinforcement_training import make_environment, make_learner
 from agents.reinforcement.sac import DemonstrationBuffer
 from agents.reinforcement.training_environment import native_environment
-from agents.reinforcement.training_progress import Progress
 from agents.reinforcement.warm_start import fly_again
 from agents.run_folder import RunFolder
 from agents.training import train

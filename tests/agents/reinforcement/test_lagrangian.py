@@ -16,8 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.configuration import ConfigurationError, load_configuration
 from agents.reinforcement.callback import TrainingCallback, _score
+from agents.reinforcement.checkpoint import Progress
 from agents.reinforcement.lagrangian import Lagrangian
-from agents.reinforcement.training_progress import Progress
 from agents.run_folder import RunFolder, RunFolderError
 from agents.training import train
 from agents.vec_env import SB3VecEnv
