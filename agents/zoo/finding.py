@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from agents.policies import ExportedPolicy
 from agents.policies.chunking import ChunkingPolicy, load_exported
 from agents.policies.flying import Policy
+from agents.run_folder import POLICY
 from agents.zoo.model_archive import (
     ModelArchiveError,
     NeedsCodeError,
@@ -27,8 +28,6 @@ from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.task.step_report import n_observations
-
-POLICY_OF_A_RUN = "policy.npz"
 
 
 class PolicyError(ValueError):
@@ -142,7 +141,7 @@ def policy_path(policy: str | Path) -> Path:
     """Resolve a name in the zoo, a run folder or a path to a file."""
     path = Path(policy)
     if path.is_dir():
-        return path / POLICY_OF_A_RUN
+        return path / POLICY
     if isinstance(policy, str) and not path.suffix and len(path.parts) == 1:
         try:
             return policy_file(policy)
@@ -192,7 +191,7 @@ def sees_goals(policy: ExportedPolicy) -> bool:
 
 def _label(policy: str | Path) -> str:
     path = Path(policy)
-    if path.name == POLICY_OF_A_RUN:
+    if path.name == POLICY:
         path = path.parent
     return path.name if path.suffix != ".npz" else "/".join(path.parts[-2:])
 
