@@ -6,10 +6,10 @@ import io
 import itertools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Pillow
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene
@@ -29,15 +29,11 @@ from dq_space_arm_env.viewing.replay.flights import ShownFlight, prepare, target
 from dq_space_arm_env.viewing.replay.geometry import view_of
 from experts.maneuver import Maneuver
 
-if TYPE_CHECKING:
-    from PIL.Image import Image as PillowImage
-
 Image = NDArray[np.uint8]
 
 FASTEST = 50.0
 """Pictures per second, 1/s: players slow down pictures shorter than 0.02 s."""
 
-NO_PILLOW = 'a GIF, PNG or WebP needs Pillow, which is not installed: pip install "dq-space-arm[plots]"'
 _LONGEST_HOLD = 600.0  # s; the file has 16 bits for hundredths of a second
 _GAP = 4  # pixels between the pictures of a strip
 _MARGIN = 0.03  # around a whole maneuver, of its extent
@@ -102,10 +98,6 @@ def _camera_of_all(shown: ShownFlight, scene: Scene, picture: PictureFormat) -> 
 
 def encode_strip(pictures: Sequence[Image], colors: int = 192) -> bytes:
     """Encode RGB pictures of one height as a PNG, side by side, with white between them."""
-    try:
-        from PIL import Image as Pillow
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(NO_PILLOW) from error
     between = np.full((len(pictures[0]), _GAP, 3), 255, np.uint8)
     row = [part for picture in pictures for part in (between, picture)][1:]
     strip = Pillow.fromarray(np.hstack(row)).quantize(colors, Pillow.Quantize.MEDIANCUT)
@@ -130,12 +122,8 @@ def encode_gif(pictures: Sequence[Image], fps: float, hold: float, colors: int =
     What does not change from one picture to the next is transparent and costs next to nothing.
     """
     check_gif(fps, hold, colors)
-    try:
-        from PIL import Image as Pillow
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(NO_PILLOW) from error
     palette = Pillow.fromarray(_typical_colors(pictures)).quantize(colors, Pillow.Quantize.MEDIANCUT)
-    frames: list[PillowImage] = []
+    frames: list[Pillow.Image] = []
     before = None
     for picture in pictures:
         frame = Pillow.fromarray(picture).quantize(palette=palette, dither=Pillow.Dither.NONE)
@@ -166,10 +154,6 @@ def encode_gif(pictures: Sequence[Image], fps: float, hold: float, colors: int =
 def encode_webp(pictures: Sequence[Image], fps: float, hold: float, quality: int) -> bytes:
     """Encode RGB pictures as a WebP that loops, in half the bytes of a GIF; quality 0 to 100."""
     check_gif(fps, hold, 2)
-    try:
-        from PIL import Image as Pillow
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(NO_PILLOW) from error
     frames = [Pillow.fromarray(picture) for picture in pictures]
     durations = [round(1000.0 / fps)] * (len(frames) - 1) + [round(1000.0 * hold)]
     # A whole picture costs as much as all that follow: none but the first.

@@ -1,7 +1,7 @@
 """The figures of a maneuver as files."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -48,21 +48,18 @@ def write_figures(
     Returns:
         The files; figures of actuators that the scene does not have are left out.
     """
-    draw: dict[str, Callable[[Maneuver], Figure | None]] = {
-        "figure-2-snapshots": figure_2,
-        "figure-3-pose-error": figure_3,
-        "figure-4-error-norms": figure_4,
-        "figure-5-base-inputs": figure_5,
-        "figure-6-arm-inputs": figure_6,
+    draw: dict[str, Draw] = {
+        "figure-2-snapshots": partial(figure_2, maneuver),
+        "figure-3-pose-error": partial(figure_3, maneuver),
+        "figure-4-error-norms": partial(figure_4, maneuver),
+        "figure-5-base-inputs": partial(figure_5, maneuver),
+        "figure-6-arm-inputs": partial(figure_6, maneuver),
+        **more,
     }
-    return _write({name: partial(each, maneuver) for name, each in draw.items()} | more, folder, formats)
-
-
-def _write(figures: Mapping[str, Draw], folder: Path, formats: Sequence[str]) -> list[Path]:
     files = []
     with house_style():
-        for name, draw in figures.items():
-            figure = draw()
+        for name, make in draw.items():
+            figure = make()
             for format_ in formats:
                 file = folder / f"{name}.{format_}"
                 if figure is None:

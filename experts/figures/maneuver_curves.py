@@ -14,9 +14,9 @@ from experts.figures.style import (
     LINE_STYLES,
     VERMILION,
     WIDTH,
-    draw_curves,
     draw_steps,
     finish_panel,
+    look,
 )
 from experts.maneuver import (
     ActuatorHistory,
@@ -46,10 +46,10 @@ def figure_3(maneuver: Maneuver) -> Figure:
     time, quaternion = maneuver.time, maneuver.error_pose[:, :4]
     upper.plot(time, quaternion[:, 0], color=BLACK, linestyle=LINE_STYLES[3], label="$q_0$")
     for axis in (2,) if planar else (0, 1, 2):
-        draw_curves(upper, time, quaternion[:, [axis + 1]], [f"$q_{axis + 1}$"], first=axis)
+        upper.plot(time, quaternion[:, axis + 1], label=f"$q_{axis + 1}$", **look(axis))
     finish_panel(upper, r"Error quaternion $q_{D/G}$", "component [$-$]")
     for axis in (0, 1) if planar else (0, 1, 2):
-        draw_curves(lower, time, maneuver.position_error[:, [axis]], [f"$r_{'xyz'[axis]}$"], first=axis)
+        lower.plot(time, maneuver.position_error[:, axis], label=f"$r_{'xyz'[axis]}$", **look(axis))
     finish_panel(lower, r"Position error $r_{D/G}$ in the axes of $G$", "position [m]")
     return figure
 

@@ -92,20 +92,12 @@ def finish_panel(axes: Axes, title: str, label: str) -> None:
             axes.legend(loc="upper right", ncols=min(len(handles), _MOST_BESIDE))
 
 
-def draw_curves(
-    axes: Axes, time: FloatArray, values: FloatArray, symbols: Sequence[str], first: int = 0
-) -> None:
-    """Draw the columns of `values`, shape (n, curves), as curves in the order of colors and line styles."""
-    for index, (column, symbol) in enumerate(zip(values.T, symbols, strict=True), first):
-        axes.plot(time, column, label=symbol, **_look(index))
-
-
 def draw_steps(axes: Axes, edges: FloatArray, values: FloatArray, symbols: Sequence[str]) -> None:
     """Draw the columns of `values`, shape (n, inputs), constant between edges, shape (n + 1,)."""
     for index, (column, symbol) in enumerate(zip(values.T, symbols, strict=True)):
-        axes.stairs(column, edges, baseline=None, label=symbol, **_look(index))
+        axes.stairs(column, edges, baseline=None, label=symbol, **look(index))
 
 
-def _look(index: int) -> dict[str, Any]:
+def look(index: int) -> dict[str, Any]:
     """Color and line style of a curve; the seventh has the first color and the second style."""
     return {"color": COLORS[index % 6], "linestyle": LINE_STYLES[(index + index // 6) % 6]}
