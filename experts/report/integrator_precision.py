@@ -64,14 +64,9 @@ class Motion:
         return np.asarray(states)
 
 
-def with_simulation(scene: Scene, **changes: Any) -> Scene:
-    """The scene with other settings of its simulation."""
-    return scene.replace(simulation=changes)
-
-
 def expert_motion(scene: Scene, max_iterations: int) -> Motion:
     """The expert's maneuver, converged or not; free motion where the expert diverges."""
-    scene = with_simulation(scene, precision="float64")
+    scene = scene.replace(simulation={"precision": "float64"})
     solution = uninterrupted(BoxDDP(scene, max_iterations=max_iterations).solve())
     controls = solution.controls if np.isfinite(solution.cost) else np.zeros_like(solution.controls)
     return Motion(scene, np.array(solution.states[0]), np.array(controls), solution.parameters[:-1])
@@ -148,7 +143,7 @@ def _variants(scene: Scene) -> Iterator[_Variant]:
             continue
         for tolerance in ACCURACIES:
             changes = {"integrator": name, **entry.within(tolerance)}
-            yield name, compile_scene(with_simulation(scene, **changes)), tolerance
+            yield name, compile_scene(scene.replace(simulation=changes)), tolerance
 
 
 def _step_times(
@@ -198,9 +193,9 @@ def observed_order(steps: Sequence[float], errors: Sequence[float], uncertainty:
     return float(np.median(slopes[-_SLOPES:])) if slopes else None
 
 
-def cheapest(rows: Iterable[Row], accuracy: float, time: str, error: str = "error") -> Row | None:
-    """The row of the smallest time among those whose error is at most an accuracy; columns by name."""
-    good = [row for row in rows if row[error] is not None and row[error] <= accuracy]
+def cheapest(rows: Iterable[Row], accuracy: float, time: str) -> Row | None:
+    """The row of the smallest time, a column, among those whose error is at most an accuracy."""
+    good = [row for row in rows if row["error"] is not None and row["error"] <= accuracy]
     return min(good, key=lambda row: float(row[time]), default=None)
 
 

@@ -29,7 +29,7 @@ from dq_space_arm_env.scene import INTEGRATORS, Scene
 from dq_space_arm_env.scene.bodies import freedoms
 from experts.problems.shooting_problem import FloatArray
 from experts.report.effort import Announce, Effort
-from experts.report.integrator_precision import tip_error, with_simulation
+from experts.report.integrator_precision import tip_error
 
 CLOSE = 0.01
 """An integrator holds while the tip ends within so many m and rad."""
@@ -49,7 +49,7 @@ Holds = Callable[[float], bool]
 
 def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[Row]]:
     """The envelope of each integrator."""
-    scene = with_simulation(scene, precision="float64")
+    scene = scene.replace(simulation={"precision": "float64"})
     dt = scene.simulation.dt
     searches = [
         ("step", "s", _slow_motion(scene), dt, _STEP_RANGE),

@@ -66,22 +66,16 @@ def measure(effort: Effort) -> Iterator[Row]:
             yield from case.rows(effort)
 
 
+_PLOT = {"x": "x", "y": "y", "color": "subject", "log": "xy", "floor": 1e-16}
+
+
 def _long_motions(part: str, caption: str, labels: Mapping[str, str]) -> Picture:
     """A picture of the long motions, a panel for each."""
-    plot = {
-        "x": "x",
-        "y": "y",
-        "color": "subject",
-        "facet": "name",
-        "columns": 3,
-        "log": "xy",
-        "floor": 1e-16,
-    }
     return Picture(
         f"stability_long_motions_{part}",
         f"curves of {long_motions.GROUP}",
         caption,
-        {**plot, "floor": 1e-16, "labels": labels},
+        {**_PLOT, "facet": "name", "columns": 3, "labels": labels},
         lambda row: row["name"].startswith(part),
     )
 
@@ -98,11 +92,8 @@ BENCHMARK = Benchmark(
             f"curves of {masses.GROUP}",
             "Error of the accelerations over the ratio of base to arm mass; dashed: the bound.",
             {
-                "x": "x",
-                "y": "y",
-                "color": "subject",
+                **_PLOT,
                 "facet": "name",
-                "log": "xy",
                 "floor": 1e-17,
                 "levels": (masses.BACKWARD_BOUND,),
                 "labels": {"x": "mass of base / mass of arm [$-$]", "y": "error [$-$]"},
@@ -114,11 +105,7 @@ BENCHMARK = Benchmark(
             f"Largest change of energy of a joint on its spring in {stiff_joints.STEPS} steps over the "
             "product of step and frequency: 1 where it is damped, at the upper edge where it blew up.",
             {
-                "x": "x",
-                "y": "y",
-                "color": "subject",
-                "log": "xy",
-                "floor": 1e-16,
+                **_PLOT,
                 "labels": {"x": r"$\Delta t\,\omega$ [$-$]", "y": "largest change / first energy [$-$]"},
             },
         ),
@@ -128,13 +115,9 @@ BENCHMARK = Benchmark(
             "Error of pose and angles after 0.3 s in steps of 15 ms over the first deflection, or rate, of a "
             "stiff joint; dashed: the bound. A point is missing where the method tells that it is not right.",
             {
-                "x": "x",
-                "y": "y",
-                "color": "subject",
+                **_PLOT,
                 "facet": "name",
                 "columns": 3,
-                "log": "xy",
-                "floor": 1e-16,
                 "levels": (finite_deflections.RIGHT,),
                 "labels": {"x": "deflection [rad], rate [rad/s]", "y": "error [rad, m]"},
             },

@@ -19,7 +19,6 @@ from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.robots import OTHER_MOTIONS, robots
 from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome
-from scripts.benchmarks.stability.scenes import with_simulation
 from scripts.benchmarks.stability.time_steps import moving_start
 
 GROUP = "divided steps"
@@ -65,7 +64,7 @@ def cases() -> Iterator[Case]:
 @cache
 def _reference(scene: Scene) -> Kernels:
     keys = {"integrator": "rk8", "rtol": None, "atol": None, "tolerance": _REFERENCE}
-    return compile_scene(with_simulation(scene, **keys))
+    return compile_scene(scene.replace(simulation=keys))
 
 
 def _walk(kernels: Kernels, x: FloatArray, u: FloatArray, divided: bool) -> FloatArray:
@@ -110,7 +109,7 @@ def _episodes(name: str, kind: str, effort: Effort) -> Outcome:
 
 def _spin(method: str, spin: float, effort: Effort) -> Outcome:
     """Let the paper's robot tumble, its joints moving, in the scene's steps."""
-    scene = with_simulation(load_scene("paper"), integrator=method, tolerance=1e-6)
+    scene = load_scene("paper").replace(simulation={"integrator": method, "tolerance": 1e-6})
     kernels = compile_scene(scene)
     x = moving_start(kernels)
     x[kernels.layout.state.angular_velocity] = spin * np.array([0.48, -0.6, 0.64])

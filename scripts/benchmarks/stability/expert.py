@@ -51,9 +51,8 @@ def cases() -> Iterator[Case]:
             run = partial(_solve_at_target, scene, solver)
             title = f"start at the target, {scene}"
             yield Case(GROUP, title, solver.__name__, criterion, run, 1e-12, "rad, m")
-    criterion = _TRUE
     title = "horizon of 20,000; of 2,000 in a quick run"
-    yield Case(GROUP, title, "BoxDDP", criterion, _long_horizon, 1e-12, "of the states")
+    yield Case(GROUP, title, "BoxDDP", _TRUE, _long_horizon, 1e-12, "of the states")
     for limit in (0.0, -1.0, np.nan):
         name, run = f"limit of {limit:g}", partial(_refused_limit, limit)
         yield Case(GROUP, name, "scene", "refused, naming the limit", run)

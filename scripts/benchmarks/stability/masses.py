@@ -31,7 +31,7 @@ from scripts.benchmarks.stability.references import (
     errors,
     linear_system,
 )
-from scripts.benchmarks.stability.scenes import random_state, with_base, with_links, with_mass_ratio
+from scripts.benchmarks.stability.scenes import random_state, with_links, with_mass_ratio
 
 GROUP = "masses"
 BACKWARD, FORWARD = "backward error", "forward error"
@@ -115,7 +115,7 @@ def _with_needles(moments: tuple[float, ...]) -> Callable[[], Scene]:
 
 
 def _with_needle_base(moments: tuple[float, ...]) -> Callable[[], Scene]:
-    return lambda: with_base(load_scene("paper"), inertia=[10.0 * moment for moment in moments])
+    return lambda: load_scene("paper").replace(base={"inertia": [10.0 * moment for moment in moments]})
 
 
 def _mass_ratios(formulation: str, measure: str) -> Case:
@@ -160,13 +160,13 @@ def _forward(scene: Callable[[], Scene], formulation: str, effort: Effort) -> Ou
     )
 
 
-def samples(scene: Scene, count: int, scale: float = 1.0) -> list[Sample]:
+def samples(scene: Scene, count: int) -> list[Sample]:
     """Random states and inputs of a scene."""
     found = []
     for seed in range(count):
         rng = np.random.default_rng(seed)
         sample = Sample.of(scene, np.zeros(0), np.zeros(0))
-        state = random_state(sample.kernels, rng, scale)
+        state = random_state(sample.kernels, rng)
         if sample.kernels.dtype == np.float32:
             state = state.astype(np.float32).astype(np.float64)
         found.append(Sample.of(scene, state, rng.normal(size=sample.kernels.n_u)))
@@ -215,8 +215,8 @@ def _refusals() -> Iterator[Case]:
         "base without inertia about one axis": (_with_needle_base((0.0, 1.0, 1.0)), "inertia"),
         "inertia that no body has (1, 1, 3)": (_with_needles((1.0, 1.0, 3.0)), "inertia"),
         "link without mass": (lambda: with_links(load_scene("paper"), mass=0.0), "mass"),
-        "base with negative mass": (lambda: with_base(load_scene("paper"), mass=-1.0), "mass"),
-        "infinite mass": (lambda: with_base(load_scene("paper"), mass=float("inf")), "mass"),
+        "base with negative mass": (lambda: load_scene("paper").replace(base={"mass": -1.0}), "mass"),
+        "infinite mass": (lambda: load_scene("paper").replace(base={"mass": np.inf}), "mass"),
     }
 
     def refused(make: Callable[[], Scene], naming: str, effort: Effort) -> Refused:

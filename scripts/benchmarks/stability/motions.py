@@ -31,32 +31,23 @@ _TURNS = (1.0, 10.0, 1e2, 1e3, 6e3, 1e4, 1e5, 1e6)
 def cases() -> Iterator[Case]:
     for name in FORMULATIONS:
         rounding = ROUNDING.get(name, 1.0)
-        criterion = "error of the accelerations against 50 digits below 1e-12" + (
-            " times 2^29" * (rounding > 1)
-        )
-        run = partial(_fast, name)
+        bound, below = BACKWARD_BOUND * rounding, "below 1e-12" + " times 2^29" * (rounding > 1)
+        criterion = f"error of the accelerations against 50 digits {below}"
         title = "spin of 100 rad/s, joints at 50 rad/s"
-        yield Case(GROUP, title, name, criterion, run, BACKWARD_BOUND * rounding, "1")
+        yield Case(GROUP, title, name, criterion, partial(_fast, name), bound, "1")
+        criterion = f"row-wise backward error of the accelerations {below}"
         for title, angles in (("straight", (0.0, 0.0, 0.0)), ("folded", (0.0, np.pi / 2, np.pi))):
-            criterion = "row-wise backward error of the accelerations below 1e-12" + (
-                " times 2^29" * (rounding > 1)
-            )
             run = partial(_configuration, name, angles)
-            yield Case(GROUP, f"arm {title}", name, criterion, run, BACKWARD_BOUND * rounding, "1")
-        criterion = "row-wise backward error of the accelerations below 1e-12" + (
-            " times 2^29" * (rounding > 1)
-        )
-        run = partial(_passive, name)
+            yield Case(GROUP, f"arm {title}", name, criterion, run, bound, "1")
         title = "springs of 1e8 N m/rad, dampers of 1e6 N m s/rad in all joints"
-        yield Case(GROUP, title, name, criterion, run, BACKWARD_BOUND * rounding, "1")
+        yield Case(GROUP, title, name, criterion, partial(_passive, name), bound, "1")
     for angle in (90.0, -90.0):
+        title = f"wrist at gimbal lock, theta = {angle:g} deg"
         criterion = "rotation matrix of the tip against 50 digits below 1e-14, all derivatives finite"
         run = partial(_gimbal_lock, np.radians(angle))
-        title = f"wrist at gimbal lock, theta = {angle:g} deg"
         yield Case(GROUP, title, "tip pose, step and its derivatives", criterion, run, 1e-14, "1")
         criterion = "states and wrist rates of the guess are finite and within the limits"
         run = partial(_guess_at_gimbal_lock, np.radians(angle))
-        title = f"wrist at gimbal lock, theta = {angle:g} deg"
         yield Case(GROUP, title, "expert's screw motion", criterion, run, 0.0, "1")
     for precision in REDUCED:
         for lanes in ("one state", "batch"):

@@ -15,14 +15,9 @@ from experts.problems.shooting_problem import FloatArray
 PRECISIONS = ("float64", "float32")
 
 
-def with_simulation(scene: Scene, **changes: Any) -> Scene:
-    """A scene with other settings of its simulation."""
-    return scene.replace(simulation=changes)
-
-
 def paper(precision: str = "float64", scene: str = "paper") -> Kernels:
     """Kernels of a shipped scene in a precision."""
-    return compile_scene(with_simulation(load_scene(scene), precision=precision))
+    return compile_scene(load_scene(scene).replace(simulation={"precision": precision}))
 
 
 def applied(integrator: str, precision: str) -> str:
@@ -46,10 +41,6 @@ def with_mass_ratio(ratio: float) -> Scene:
 def with_links(scene: Scene, **changes: Any) -> Scene:
     """A scene with the same fields changed in all links."""
     return scene.replace(links=[{**link.model_dump(), **changes} for link in scene.links])
-
-
-def with_base(scene: Scene, **changes: Any) -> Scene:
-    return scene.replace(base=changes)
 
 
 def random_arm(masses: Sequence[float], seed: int, payload: float = 0.0) -> Scene:
@@ -109,7 +100,7 @@ def sprung_inertia(scene: Scene) -> float:
     return own - coupled**2 / whole
 
 
-def random_state(kernels: Kernels, rng: np.random.Generator, scale: float = 1.0) -> FloatArray:
+def random_state(kernels: Kernels, rng: np.random.Generator) -> FloatArray:
     """A state anywhere: any attitude, positions of meters."""
     where, x = kernels.layout.state, rng.normal(size=kernels.n_x)
     twist = rng.normal(size=6)
@@ -117,8 +108,6 @@ def random_state(kernels: Kernels, rng: np.random.Generator, scale: float = 1.0)
         twist[[0, 1, 5]] = 0.0
     pose = np.array(screw.exponential(tuple(twist.tolist())))
     x[where.pose] = pose[[0, 3, 5, 6]] if kernels.layout.planar else pose
-    x[where.base_velocity] *= scale
-    x[where.joint_rates] *= scale
     return x
 
 

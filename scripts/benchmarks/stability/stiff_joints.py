@@ -19,10 +19,9 @@ from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome
-from scripts.benchmarks.stability.scenes import applied, sprung_inertia, sprung_joint, walk, with_simulation
+from scripts.benchmarks.stability.scenes import applied, sprung_inertia, sprung_joint, walk
 
 GROUP = "stiff joints"
-
 
 STIFF_METHODS = tuple(name for name, entry in INTEGRATORS.items() if entry.is_stiff)
 """Methods that claim any dt times frequency."""
@@ -68,22 +67,20 @@ def cases() -> Iterator[Case]:
         return Case(GROUP, name, integrator, f"{rests}; {criterion}", run, bound, "of the rate")
 
     for name, entry in INTEGRATORS.items():
-        at = "dt times frequency = " + _product_in_words(entry.imaginary_interval)
-        yield energy(springs, name, at, partial(_springs, name))
+        frequency = "dt times frequency = " + _product_in_words(entry.imaginary_interval)
+        decay = "dt times decay = " + _product_in_words(entry.real_interval)
+        yield energy(springs, name, frequency, partial(_springs, name))
         yield energy(f"{springs}, dt = 15 ms", name, "where claimed", partial(_springs_at_15_ms, name))
         products = "dt times frequency from 0.01 to 100"
         yield energy(products, name, "where claimed", partial(_products, name))
-        at = "dt times decay = " + _product_in_words(entry.real_interval)
-        yield rate(dampers, name, at, partial(_dampers, name))
+        yield rate(dampers, name, decay, partial(_dampers, name))
         yield rate(f"{dampers}, dt = 15 ms", name, "where claimed", partial(_dampers_at_15_ms, name))
         if not entry.is_stiff:
             yield energy("springs beyond the limit", name, "not claimed", partial(_spring_beyond, name))
             yield rate("dampers beyond the limit", name, "not claimed", partial(_damper_beyond, name))
         single = applied(name, "float32")
-        within = "dt times frequency = " + _product_in_words(entry.imaginary_interval)
-        yield energy(springs, single, within, partial(_springs, name, precision="float32"))
-        within = "dt times decay = " + _product_in_words(entry.real_interval)
-        yield rate(dampers, single, within, partial(_dampers, name, precision="float32"), AT_REST_SINGLE)
+        yield energy(springs, single, frequency, partial(_springs, name, precision="float32"))
+        yield rate(dampers, single, decay, partial(_dampers, name, precision="float32"), AT_REST_SINGLE)
     for name in STIFF_METHODS:
         criterion = f"energy of the free arm kept to {_ARM_ENERGY:g} over {STEPS} steps"
         run = partial(_stiff_arm, name)
@@ -98,7 +95,7 @@ def _product_in_words(limit: float) -> str:
 @cache
 def _sprung(stiffness: float, damping: float, precision: str = "float64") -> tuple[Kernels, float]:
     """Kernels of a sprung joint, and the inertia that it turns."""
-    scene = with_simulation(sprung_joint(stiffness, damping), precision=precision)
+    scene = sprung_joint(stiffness, damping).replace(simulation={"precision": precision})
     return compile_scene(scene), sprung_inertia(scene)
 
 
