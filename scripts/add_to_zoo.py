@@ -40,7 +40,7 @@ from agents.zoo.finding import as_policy, check_fit, policy_path
 from agents.zoo.shelf import MOST_BYTES, SHELF, ZooError, file_hash, list_policies
 from dq_space_arm_env import Scene, list_scenes, load_scene
 from dq_space_arm_env.command_line.verb_program import run_to_end
-from dq_space_arm_env.common.console import complain
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.tables import TextTable
@@ -363,8 +363,6 @@ def _percent(interval: list[float | None] | None) -> str:
     return f"{value} [{', '.join(bounds)}]" if bounds else value
 
 
-FAILURE = 1
-
 _DESCRIPTION = """Put a trained policy into the zoo, with its evaluation and its model card.
 
 It is evaluated on the 500 evaluation starts under all conditions. The zoo takes policies trained from a
@@ -418,7 +416,7 @@ def _run(options: argparse.Namespace) -> int:
         complain(str(error))
         return FAILURE
     Console(highlight=False).print(f"{written}: its card; weights and evaluation beside it", markup=False)
-    return 0
+    return SUCCESS
 
 
 if __name__ == "__main__":

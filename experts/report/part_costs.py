@@ -51,6 +51,12 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
     return {"parts": list(rows)}
 
 
+def finite_limits(kernels: Kernels) -> FloatArray:
+    """Limits of the inputs, shape (n_u,), units of `layout.control`; 1 for an input without limit."""
+    limit = kernels.layout.control_limit
+    return np.where(np.isfinite(limit), limit, 1.0)
+
+
 def moving_states(kernels: Kernels, count: int) -> tuple[FloatArray, FloatArray]:
     """Moving states around the scene's start, and inputs within their limits, always the same."""
     rng = np.random.default_rng(0)
@@ -59,8 +65,7 @@ def moving_states(kernels: Kernels, count: int) -> tuple[FloatArray, FloatArray]
     x = np.ascontiguousarray(x, kernels.dtype)
     for part, size in ((layout.state.base_velocity, 0.2), (layout.state.joint_rates, 0.5)):
         x[:, part] += rng.uniform(-size, size, x[:, part].shape)
-    limit = np.where(np.isfinite(layout.control_limit), layout.control_limit, 1.0)
-    return x, (limit * rng.uniform(-1.0, 1.0, (count, kernels.n_u))).astype(kernels.dtype)
+    return x, (finite_limits(kernels) * rng.uniform(-1.0, 1.0, (count, kernels.n_u))).astype(kernels.dtype)
 
 
 def section(scene: Scene, found: dict[str, list[Row]]) -> Section:

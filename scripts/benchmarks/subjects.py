@@ -20,8 +20,7 @@ import numpy as np
 from dq_space_arm_env import Kernels, Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene.start import number_of_draws
-from experts.problems.shooting_problem import FloatArray
-from experts.report.part_costs import moving_states
+from experts.report.part_costs import finite_limits, moving_states
 from experts.report.timing import time_in_turns
 from scripts.benchmarks.effort import Sampling
 from scripts.benchmarks.harness import Row, select
@@ -111,12 +110,6 @@ PROGRAMS = {
 }
 
 
-def finite_limits(kernels: Kernels) -> FloatArray:
-    """Limits of the inputs, shape (n_u,), units of `layout.control`; 1 for an input without limit."""
-    limit = kernels.layout.control_limit
-    return np.where(np.isfinite(limit), limit, 1.0)
-
-
 def kernel_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
     """All timed kernels of a scene for each batch size: scalar code, and vector code in each variant.
 
@@ -167,7 +160,7 @@ def kernel_case(
     return Case(subject, run)
 
 
-def episodes_case(scene: Scene, copies: int = 128, decisions: int = 50) -> Case:
+def episodes_case(scene: Scene) -> Case:
     """Gradient by the weights of the episodes of an update of `apg`: policy, steps and both back."""
     from threadpoolctl import ThreadpoolController
 
@@ -175,6 +168,7 @@ def episodes_case(scene: Scene, copies: int = 128, decisions: int = 50) -> Case:
     from agents.gradients.layers import Layers, random_weights
     from agents.gradients.starts import Starts
 
+    copies, decisions = 128, 50
     times = decision_times(scene, decisions, crowding=0.8)
     starts = Starts.draw(scene, copies, times, 0, (1.0,))[1]
     kernels = compile_scene(scene)

@@ -60,9 +60,9 @@ class BasiliskTwin:
             places.append(np.array(rotation) @ np.array(point) + np.array(position))
         return np.average(places, axis=0, weights=masses), float(masses.sum())
 
-    def add(self, effector: Any, *, dynamic: bool = False) -> None:
+    def add(self, effector: Any) -> None:
         """Attach an effector to the hub."""
-        (self.hub.addDynamicEffector if dynamic else self.hub.addStateEffector)(effector)
+        self.hub.addStateEffector(effector)
         self.models.insert(-1, effector)
 
     def command(self, reader: Any, kind: str, field: str, values: Sequence[float]) -> Any:

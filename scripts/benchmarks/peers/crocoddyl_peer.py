@@ -40,8 +40,6 @@ def solve_with_crocoddyl(
     *,
     method: str = "box_ddp",
     max_iterations: int = 300,
-    threads: int = 1,
-    initial_regularization: float = INITIAL_REGULARIZATION,
     exact_pose_cost: bool = False,
 ) -> SolverRun:
     """Solve a maneuver with Crocoddyl.
@@ -59,15 +57,13 @@ def solve_with_crocoddyl(
     first = np.zeros((problem.horizon, problem.n_controls)) if u_init is None else u_init
     maneuver = CrocoddylManeuver(problem, exact_pose_cost=exact_pose_cost)
     maneuver.start_at(start)
-    if threads > 1:  # one is the default, and setting it warns where the build has no threads
-        maneuver.shooting.nthreads = threads
     solver = getattr(crocoddyl, METHODS[method])(maneuver.shooting)
     inputs = maneuver.model_inputs(first)
     watch = _watch()
     solver.setCallbacks([watch])
     watch.begin()
     states = maneuver.shooting.rollout(inputs)
-    converged = bool(solver.solve(states, inputs, max_iterations, True, initial_regularization))
+    converged = bool(solver.solve(states, inputs, max_iterations, True, INITIAL_REGULARIZATION))
     iterates = [first, *(maneuver.controls(us) for us in watch.inputs)]
     costs = costs_of(problem, start, iterates)
     seconds = np.array([0.0, *watch.seconds])

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from dq_space_arm_env import Kernels
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from experts.problems.shooting_problem import FloatArray
+from experts.report.part_costs import finite_limits
 from scripts.benchmarks.peers.robot import Robot
 from scripts.benchmarks.subjects import (
     DYNAMICS,
@@ -31,7 +32,6 @@ from scripts.benchmarks.subjects import (
     SYNCHRONOUS_COPIES,
     Case,
     Subject,
-    finite_limits,
     single_case,
     vector_case,
 )

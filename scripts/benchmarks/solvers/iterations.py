@@ -21,7 +21,7 @@ from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row
-from scripts.benchmarks.solvers.runs import TITLES
+from scripts.benchmarks.solvers.runs import TITLES, median_ms
 
 
 def measure_iterations(problem: ArmProblem, effort: Effort) -> Iterator[Row]:
@@ -65,16 +65,12 @@ def variant_row(
         "stop_reason": first.stop_reason.value,
         "best_s": min(seconds for _, seconds in solutions),
         "median_s": float(np.median([seconds for _, seconds in solutions])),
-        "iteration_ms": _median_ms(history["seconds"]),
-        "derivatives_ms": _median_ms(times["derivative"]),
-        "sweep_ms": _median_ms(times["sweep"]),
-        "rollout_ms": _median_ms(times["rollout"]),
-        "rest_ms": _median_ms(rest),
+        "iteration_ms": median_ms(history["seconds"]),
+        "derivatives_ms": median_ms(times["derivative"]),
+        "sweep_ms": median_ms(times["sweep"]),
+        "rollout_ms": median_ms(times["rollout"]),
+        "rest_ms": median_ms(rest),
     }
-
-
-def _median_ms(seconds: FloatArray) -> float:
-    return 1e3 * float(np.median(seconds)) if len(seconds) else 0.0
 
 
 def time_pieces(problem: ArmProblem, controls: FloatArray, repeats: int) -> Iterator[Row]:

@@ -160,7 +160,7 @@ def _timed_run(
 
     solution = uninterrupted(solve(callback=look_at_clock))
     fields = {"derivatives": "derivative_seconds", "sweep": "sweep_seconds", "rollout": "rollout_seconds"}
-    parts = {part: _median_ms([getattr(record, name) for record in records]) for part, name in fields.items()}
+    parts = {part: median_ms([getattr(record, name) for record in records]) for part, name in fields.items()}
     return SolverRun(
         solver=name,
         costs=np.array(costs),
@@ -174,8 +174,9 @@ def _timed_run(
     )
 
 
-def _median_ms(seconds: list[float]) -> float:
-    return 1e3 * float(np.median(seconds)) if seconds else 0.0
+def median_ms(seconds: Sequence[float] | FloatArray) -> float:
+    """The median, ms; 0 without any."""
+    return 1e3 * float(np.median(seconds)) if len(seconds) else 0.0
 
 
 def _cost(problem: ArmProblem, controls: FloatArray, x0: FloatArray | None) -> float:

@@ -7,7 +7,7 @@ much of the core it uses.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from llvmlite import ir
@@ -56,9 +56,9 @@ class MultiplyAdd:
         return 2e-9 * sums.size * count / best
 
 
-def measure_peak(repeats: int, precisions: Sequence[str] = PRECISIONS) -> Iterator[Row]:
+def measure_peak(repeats: int) -> Iterator[Row]:
     """The peak of this process's core for each precision; a multiply-add is two operations."""
-    for precision in precisions:
+    for precision in PRECISIONS:
         candidates = [MultiplyAdd(precision, count) for count in ACCUMULATORS]
         rates = [candidate.operations_per_ns(repeats) for candidate in candidates]
         best = int(np.argmax(rates))

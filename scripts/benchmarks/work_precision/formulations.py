@@ -36,9 +36,9 @@ LIMITS = {FLOAT64: 1e-12, FLOAT32: 1e-3}
 _BATCH = 1024
 
 
-def measure_formulations(effort: Effort, scene_name: str = "paper") -> Iterator[Row]:
-    """Compare the accelerations of a scene's robot: a row and a claim for each formulation and precision."""
-    scene = load_scene(scene_name)
+def measure_formulations(effort: Effort) -> Iterator[Row]:
+    """Compare accelerations of the paper's robot: a row and a claim for each formulation and precision."""
+    scene = load_scene("paper")
     kernels = Variant(FLOAT64).compile(scene)
     x, u = _representable(*moving_states(kernels, effort.accuracy_states))
     many = _representable(*moving_states(kernels, _BATCH))
