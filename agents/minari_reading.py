@@ -35,7 +35,7 @@ from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.task.step_report import n_observations
 from experts.ddp.solution import StopReason
 from experts.demonstrations import Demonstrations, DemonstrationsError, load_demonstrations
-from experts.demonstrations.folder import MANIFEST, SETTINGS, SHARDS
+from experts.demonstrations.folder import MANIFEST, SETTINGS, SHARDS, manifest_of, manifest_text
 from experts.demonstrations.minari_export import MINARI_MISSING, check_dataset_id
 from experts.demonstrations.outcomes import GUESSES, REASONS
 from experts.demonstrations.settings import FORMAT, SHARD_SIZE
@@ -65,33 +65,18 @@ def read_from_minari(dataset_id: str, folder: Path) -> Demonstrations:
     (folder / SHARDS).mkdir(parents=True)
     kernels = Demonstrations(folder, settings, {"shards": [], "demonstrations": 0}).kernels
     shapes = _shapes(kernels), (*kernels.parameters.moving, *kernels.parameters.staged)
-    shards = []
+    paths = []
     with closing(WorkerProcess(quiet=True)) as worker:
         for number, first in enumerate(range(0, count, SHARD_SIZE)):
             episodes = range(first, min(first + SHARD_SIZE, count))
             worker.assign(packed_episodes, place / "main_data.hdf5", episodes, *shapes)
             with _damage_named(dataset_id):
                 content = worker.answer()
-            digest = hashlib.sha256(content).hexdigest()
-            name = f"{number:06d}-{digest}.safetensors"
-            write_atomically(folder / SHARDS / name, content)
-            shards.append(
-                {
-                    "file": name,
-                    "sha256": digest,
-                    "bytes": len(content),
-                    "demonstrations": len(episodes),
-                    "failures": 0,
-                }
-            )
+            name = f"{number:06d}-{hashlib.sha256(content).hexdigest()}.safetensors"
+            paths.append(folder / SHARDS / name)
+            write_atomically(paths[-1], content)
     write_atomically(folder / SETTINGS, text)
-    manifest = {
-        "settings_sha256": hashlib.sha256(text.encode()).hexdigest(),
-        "demonstrations": count,
-        "failures": {},
-        "shards": shards,
-    }
-    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=2) + "\n")
+    write_atomically(folder / MANIFEST, manifest_text(manifest_of(folder / SETTINGS, paths)))
     return load_demonstrations(folder)
 
 
@@ -156,9 +141,7 @@ def _shapes(kernels: Kernels) -> Shapes:
     }
 
 
-def packed_episodes(
-    path: Path, episodes: Sequence[int], shapes: Shapes, moving: tuple[int, ...] = ()
-) -> bytes:
+def packed_episodes(path: Path, episodes: Sequence[int], shapes: Shapes, moving: tuple[int, ...]) -> bytes:
     """Read episodes of an HDF5 file, and pack them as a shard, see `experts.demonstrations.shard`.
 
     The parameters `moving` change from row to row; those of the first row are kept.
