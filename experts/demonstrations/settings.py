@@ -86,7 +86,7 @@ class Settings:
 def software() -> dict[str, Any]:
     """Identify the code that turns settings into demonstrations: a hash, and versions of packages."""
     return {
-        "source": _source_hash(),
+        "source": source_hash(),
         "versions": {
             "dq-space-arm": dq_space_arm_env.__version__,
             **{package: version(package) for package in PACKAGES},
@@ -95,12 +95,12 @@ def software() -> dict[str, Any]:
 
 
 @cache
-def _source_hash() -> str:
-    """Hash the code that demonstrations come from: environment and experts, without `PRESENTATION`."""
+def source_hash(without: tuple[str, ...] = PRESENTATION) -> str:
+    """Hash the code of environment and experts without some packages: what demonstrations come from."""
     digest = hashlib.sha256()
     for package in (dq_space_arm_env, experts):
         folder = Path(str(package.__file__)).parent
         for path in sorted(folder.rglob("*.py")):
-            if path.relative_to(folder).parts[0] not in PRESENTATION:
+            if path.relative_to(folder).parts[0] not in without:
                 digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 from pathlib import Path
@@ -12,14 +11,13 @@ from typing import Any
 
 from rich.console import Console
 
-import dq_space_arm_env
-import experts
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.progress import ProgressDisplay, Status
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.report_page import Page, Section
 from dq_space_arm_env.scene import Scene
+from experts.demonstrations.settings import source_hash
 from experts.report import expert_trials, integrator_precision, part_costs, stability_envelope
 from experts.report.effort import FULL, QUICK, Effort
 
@@ -60,7 +58,7 @@ def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False)
         "quick": quick,
         "versions": origin["versions"],
         "commit": origin["commit"],
-        "source": _source_hash(),
+        "source": source_hash(without=()),  # a commit does not tell which of its files were changed
     }
     found = _unfinished(folder / f"{NAME}.json", {"request": request, "machine": origin["machine"]})
     if found:
@@ -83,15 +81,6 @@ def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False)
         sections[name].print(console)
     console.print(f"{folder}: {', '.join(files)}", markup=False)
     return page
-
-
-def _source_hash() -> str:
-    """Hash of what is measured: a commit does not tell which of its files were changed."""
-    digest = hashlib.sha256()
-    for package in (dq_space_arm_env, experts):
-        for path in sorted(Path(str(package.__file__)).parent.rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def _measured(name: str, scene: Scene, effort: Effort, console: Console) -> dict[str, Any]:

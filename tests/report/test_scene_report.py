@@ -356,7 +356,7 @@ def test_times_of_another_machine_or_source_are_not_kept(
     if changed == "machine":
         monkeypatch.setattr(scene_report, "provenance", lambda: elsewhere)
     else:
-        monkeypatch.setattr(scene_report, "_source_hash", lambda: "changed")
+        monkeypatch.setattr(scene_report, "source_hash", lambda without: "changed")
     scene_report.report(short_scene, tmp_path, Console(), quick=True)
     assert [part.measured for part in parts.values()] == [2, 2]
 
