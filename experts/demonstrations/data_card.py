@@ -12,11 +12,17 @@ from string import Template
 
 from dq_space_arm_env.common.shown_text import markdown_text
 from dq_space_arm_env.common.tables import TextTable
-from dq_space_arm_env.task.step_report import n_observations
 from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations import facts as tables
 from experts.demonstrations.facts import Facts
-from experts.demonstrations.shard import FAILURES, PARAMETERS, SUMMARIES, TRAJECTORIES, with_parameters
+from experts.demonstrations.shard import (
+    FAILURES,
+    PARAMETERS,
+    SUMMARIES,
+    TRAJECTORIES,
+    array_kinds,
+    with_parameters,
+)
 
 MEANINGS = {
     "states": "states of the environment, including the last one",
@@ -219,20 +225,10 @@ def _numbers(facts: Facts) -> str:
 
 def _arrays(facts: Facts) -> list[TextTable]:
     """The arrays of a demonstration, and what varies in the scene if anything does."""
-    simulation, layout = facts.demonstrations.scene.simulation, facts.demonstrations.kernels.layout
-    n, n_x = simulation.steps, layout.n_x
-    shapes = {
-        "states": (n + 1, n_x),
-        "observations": (n + 1, n_observations(facts.demonstrations.scene)),
-        "actions": (n, layout.n_u),
-        "rewards": (n,),
-        "feedback_gains": (n, layout.n_u, layout.n_t),
-        "start_errors": (2,),
-        "final_errors": (2,),
-        PARAMETERS: (layout.n_p,),
-    }
+    layout = facts.demonstrations.kernels.layout
+    kinds = array_kinds(facts.demonstrations.scene, layout)
     rows = (
-        (f"`{name}`", str(shapes.get(name, "a number")), MEANINGS[name])
+        (f"`{name}`", str(kinds[name][1] or "a number"), MEANINGS[name])
         for name in with_parameters((*TRAJECTORIES, *SUMMARIES), layout)
     )
     arrays = TextTable("Its arrays", ("array", "shape", "meaning"), tuple(rows))

@@ -179,17 +179,22 @@ def with_parameters(names: tuple[str, ...], layout: StateLayout) -> tuple[str, .
     return (*names, PARAMETERS) if layout.n_p else names
 
 
-def check_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], scene: Scene, layout: StateLayout) -> None:
-    """Raise DemonstrationsError where a shard has other arrays than those of its scene."""
+def array_kinds(scene: Scene, layout: StateLayout) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Types of a shard's arrays, and their shapes after the first axis."""
     horizon, n_obs = scene.simulation.steps, n_observations(scene)
     sizes = {"n_x": layout.n_x, "n_u": layout.n_u, "n_t": layout.n_t, "n_obs": n_obs}
     sizes |= {"n_p": layout.n_p, "N": horizon, "N + 1": horizon + 1, "2": 2}
-    varying = _VARYING if layout.n_p else {}
-    for name, (dtype, *axes) in {**_ARRAYS, **varying}.items():
+    kinds = {**_ARRAYS, **(_VARYING if layout.n_p else {})}
+    return {name: (dtype, tuple(sizes[axis] for axis in axes)) for name, (dtype, *axes) in kinds.items()}
+
+
+def check_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], scene: Scene, layout: StateLayout) -> None:
+    """Raise DemonstrationsError where a shard has other arrays than those of its scene."""
+    for name, (dtype, rest) in array_kinds(scene, layout).items():
         first = "failures.index" if name.startswith("failures.") else "index"
         array, counted = arrays.get(name), arrays.get(first)
         rows = () if counted is None else counted.shape[:1]
-        shape = (*rows, *(sizes[axis] for axis in axes))
+        shape = (*rows, *rest)
         if array is None or array.shape != shape or array.dtype != dtype:
             found = "is missing" if array is None else f"has shape {array.shape} of {array.dtype}"
             raise DemonstrationsError(
@@ -200,7 +205,7 @@ def check_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], scene: Scene, l
             raise DemonstrationsError(
                 f"{path}: {name} has entries beyond {len(known) - 1}; generate it again"
             )
-    for name in varying:
+    for name in _VARYING if layout.n_p else ():
         if not np.isfinite(arrays[name]).all():
             raise DemonstrationsError(f"{path}: {name} should be finite; generate it again")
 
