@@ -4,13 +4,14 @@ Runs take turns, which spreads disturbances over all of them. On a shared machin
 the code can do; a median far above it shows that the machine was busy.
 """
 
-import gc
 import math
 import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+
+from dq_space_arm_env.common.first_use import collector_paused
 
 
 class Sample(NamedTuple):
@@ -42,16 +43,11 @@ def time_in_turns(
 
 def _seconds(run: Callable[[], object], calls: int) -> float:
     """Duration of calls without the garbage collector, as in `timeit`."""
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
+    with collector_paused():
         start = time.perf_counter()
         for _ in range(calls):
             run()
         return time.perf_counter() - start
-    finally:
-        if collecting:
-            gc.enable()
 
 
 def three_digits(value: float) -> str:
