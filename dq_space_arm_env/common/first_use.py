@@ -1,4 +1,4 @@
-"""Compiling code for its first use: what is said meanwhile, a message for each scene and a line on a terminal.
+"""Compiling code for its first use: what is said meanwhile, once for each scene and in a line on a terminal.
 
 Both follow the level of the logger `dq_space_arm_env`: above INFO, neither appears.
 """

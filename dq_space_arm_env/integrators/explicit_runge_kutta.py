@@ -30,22 +30,12 @@ class ExplicitRungeKutta:
 
     def append_embedded_step(self, program: Program, field: VectorField) -> None:
         """See `EmbeddedIntegrator`."""
-        tableau = self.tableau.with_end
-        stages = self._append(program, field, tableau)
+        self._append(program, field, self.tableau.with_end, estimates=True)
 
-        def estimate(h: list[Scalar], **others: list[Scalar]) -> dict[str, Any]:
-            error = combined(tableau.error, [others[f"k{i}"] for i in stages.numbers], h[0])
-            if field.pose is None:
-                return {"estimate": error}
-            twists = stages.twists([others[f"y{i}"] for i in stages.numbers])
-            moved = combined(tableau.error, stage_slopes(field.pose, tableau, twists, h[0]), h[0])
-            return {"estimate": [*(moved[i] for i in field.pose.directions), *error]}
-
-        sizes = {"h": 1, **{f"{name}{i}": field.n_y for name in "yk" for i in stages.numbers}}
-        program.call(trace(f"{stages.prefix}_estimate", sizes, estimate))
-
-    def _append(self, program: Program, field: VectorField, tableau: ButcherTableau) -> ExplicitStages:
-        """Append the step; returns its stages."""
+    def _append(
+        self, program: Program, field: VectorField, tableau: ButcherTableau, *, estimates: bool = False
+    ) -> None:
+        """Append the step; with its estimated error, if wanted."""
         stages = ExplicitStages(field, tableau)
         stages.append(program)
 
@@ -53,19 +43,23 @@ class ExplicitRungeKutta:
             stored, start = split_state(field, x)
             rates = [others.get(f"k{i}", []) for i in stages.numbers]
             y = stages.moved(start, tableau.weights, rates, h[0])  # y + h sum_i b_i k_i
+            error = combined(tableau.error, rates, h[0]) if estimates else []
             if field.pose is None:
-                return {"x_next": y}
+                return {"x_next": y} | ({"estimate": error} if estimates else {})
             twists = stages.twists([others[f"y{i}"] for i in stages.numbers])
             # q exp(Omega / 2) with Omega = h sum_i b_i w_i, w_i the slopes dexp^-1(omega_i).
-            increment = combined(tableau.weights, stage_slopes(field.pose, tableau, twists, h[0]), h[0])
-            return {"x_next": [*field.pose.moved(stored, increment), *y]}
+            slopes = stage_slopes(field.pose, tableau, twists, h[0])
+            found = {"x_next": [*field.pose.moved(stored, combined(tableau.weights, slopes, h[0])), *y]}
+            if estimates:
+                moved = combined(tableau.error, slopes, h[0])
+                found["estimate"] = [*(moved[i] for i in field.pose.directions), *error]
+            return found
 
-        sizes = {"x": field.n_x, "h": 1}
-        sizes |= {f"k{i}": field.n_y for i, w in zip(stages.numbers, tableau.weights, strict=True) if w}
+        weights = zip(stages.numbers, tableau.weights, strict=True)
+        sizes = {"x": field.n_x, "h": 1} | {f"k{i}": field.n_y for i, w in weights if w or estimates}
         if field.pose is not None:
             sizes |= {f"y{i}": field.n_y for i in stages.numbers}
         program.call(trace(f"{stages.prefix}_sum", sizes, step))
-        return stages
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         stages = ExplicitStages(field, self.tableau)

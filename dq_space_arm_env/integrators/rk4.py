@@ -70,29 +70,33 @@ class RungeKuttaMuntheKaas4:
 
         Its weights are 1/6, 1/3, 1/3, 0, 1/6: the difference is h (k4 - k5) / 6.
         """
-        rates = self._append_stages(program, field)
+        rates = self._append_stages(program, field, shows_pose_slope=field.pose is not None)
         program.call(rates, x="x_next", k="k0", rates="k5", offset="offset1")
 
         def estimate(
-            x: list[Scalar], x_next: list[Scalar], h: list[Scalar], k5: list[Scalar], **k: list[Scalar]
+            x_next: list[Scalar],
+            h: list[Scalar],
+            k4: list[Scalar],
+            k5: list[Scalar],
+            increment: Sequence[Scalar] = (),
+            pose_slope: Sequence[Scalar] = (),
         ) -> dict[str, Any]:
             sixth = h[0] * (1 / 6)
-            error = [sixth * (last - end) for last, end in zip(k["k4"], k5, strict=True)]
+            error = [sixth * (last - end) for last, end in zip(k4, k5, strict=True)]
             if field.pose is None:
                 return {"estimate": error}
-            start, end = (split_state(field, each)[1] for each in (x, x_next))
-            slopes = pose_slopes(field.pose, stage_twists(field.pose, start, list(k.values()), h[0]), h[0])
+            end = split_state(field, x_next)[1]
             there = field.pose.full_twist([end[i] for i in field.pose.twist_indices])
-            slopes.append(slope(advance([0.0] * 6, slopes, h[0]), there, 4))
-            moved = [sixth * (slopes[3][i] - slopes[4][i]) for i in field.pose.directions]
+            last = slope(increment, there, 4)
+            moved = [sixth * (pose_slope[i] - last[i]) for i in field.pose.directions]
             return {"estimate": [*moved, *error]}
 
-        sizes = {"x": field.n_x, "x_next": field.n_x, "h": 1}
-        sizes |= {f"k{i}": field.n_y for i in range(1, 6)}
+        sizes = {"x_next": field.n_x, "h": 1, "k4": field.n_y, "k5": field.n_y}
+        sizes |= {} if field.pose is None else {"increment": 6, "pose_slope": 6}
         program.call(trace(f"{field.name}_rk4_estimate", sizes, estimate))
 
-    def _append_stages(self, program: Program, field: VectorField) -> Any:
-        """The step; returns the graph of its stages."""
+    def _append_stages(self, program: Program, field: VectorField, *, shows_pose_slope: bool = False) -> Any:
+        """The step, and Omega with its slope at the last stage if wanted; returns the graph of its stages."""
 
         def stage(x: list[Scalar], u: list[Scalar], k: list[Scalar], offset: list[Scalar]) -> dict[str, Any]:
             y = [entry + offset[0] * rate for entry, rate in zip(split_state(field, x)[1], k, strict=True)]
@@ -104,8 +108,10 @@ class RungeKuttaMuntheKaas4:
             y = advance(start, stages, h[0])
             if field.pose is None:
                 return {"x_next": y}
-            increment = pose_increment(field.pose, stage_twists(field.pose, start, stages, h[0]), h[0])
-            return {"x_next": [*field.pose.moved(stored, increment), *y]}
+            slopes = pose_slopes(field.pose, stage_twists(field.pose, start, stages, h[0]), h[0])
+            increment = advance([0.0] * 6, slopes, h[0])
+            shown = {"increment": increment, "pose_slope": slopes[-1]} if shows_pose_slope else {}
+            return {"x_next": [*field.pose.moved(stored, increment), *y], **shown}
 
         n_y = field.n_y
         sizes = {"x": field.n_x, "u": field.n_u, "k": n_y, "offset": 1}
