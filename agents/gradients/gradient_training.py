@@ -35,7 +35,7 @@ from agents.run_folder import (
     validation_seeds,
 )
 from agents.zoo.starting import load_start, spent_before
-from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.bounded_formats import ARRAY_BYTES, read_arrays
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.files import write_atomically
@@ -64,7 +64,6 @@ MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives u
 CAUTION = 0.7  # factor of the learning rate when they do
 RECOVERY = 1.001  # factor by which it comes back in an update
 EVERY_STEP = 0.9  # share of the updates after which constrained episodes decide at every time step
-LAST_STARTS = 2048  # starts that they are drawn from then
 BETWEEN_DIVISIONS = 20  # updates between measurements of the integration's errors
 TOLERATED = 1e-3  # share of the cost by which the integration may change it, over all decisions
 BETWEEN_MESSAGES = 20  # updates
@@ -113,10 +112,8 @@ class _Learner:
         self._settings, self._configuration, self._scene = configuration.algorithm, configuration, scene
         settings, rng = configuration.algorithm, np.random.default_rng(configuration.seed)
         self._times = decision_times(scene, settings.decisions, settings.crowding)
-        self._mismatch = mismatch = configuration.mismatch
-        factors = (1.0,) if mismatch is None else mismatch.mass_factors
-        drawn = Starts.draw(scene, settings.starts, self._times, configuration.seed, factors)
-        self._flown, self._starts = drawn
+        self._mismatch = configuration.mismatch
+        self._flown, self._starts = self._drawn(settings.starts)
         self._mean, self._scale, units = first_units(scene, self._times, rng, configuration.seed)
         sizes = [len(self._mean), *configuration.network.hidden, StateLayout.of(scene).n_u]
         self._weights = random_weights(sizes, rng)
@@ -140,12 +137,15 @@ class _Learner:
         noisy = mismatch is not None and mismatch.noise > 0.0
         return Episodes(coarser(self._flown), layers, self._times, units, noisy=noisy)
 
+    def _drawn(self, count: int, *seeds: int) -> tuple[Scene, Starts]:
+        """Starts of the configuration's seed and others, and the scene that has their masses."""
+        factors = (1.0,) if self._mismatch is None else self._mismatch.mass_factors
+        return Starts.draw(self._scene, count, self._times, [self._configuration.seed, *seeds], factors)
+
     def _decide_at_every_step(self) -> None:
         """Go on as in flight: what violates a constraint for a moment may do so between decisions."""
         simulation, before = self._scene.simulation, self._episodes
         self._times = simulation.dt * np.arange(simulation.steps + 1)
-        states, parameters = (each[:LAST_STARTS] for each in self._starts[:2])
-        self._starts = Starts.of(compile_scene(self._flown), states, parameters, self._times)
         self._episodes = self._begin_episodes(before.units)
         self._episodes.follow_on(before)
         self._forget_costs()
@@ -199,7 +199,10 @@ class _Learner:
             self._decide_at_every_step()
         # Seeded by the update, so that checkpoints need no generator's state.
         rng = np.random.default_rng([self._configuration.seed, done])
-        rows = rng.integers(len(self._starts.states), size=settings.copies)
+        if done < self._every_step_from:
+            rows = rng.integers(len(self._starts.states), size=settings.copies)
+        else:  # new ones: from those that it was trained on, fewer flights violate constraints
+            self._starts, rows = self._drawn(settings.copies, done)[1], np.arange(settings.copies)
         self._episodes.parameters[:] = self._starts.at(rows)
         starts = self._starts.states[rows]
         since = (done / settings.updates - TRAVELLED) / (1.0 - TRAVELLED)

@@ -33,11 +33,12 @@ class Starts(NamedTuple):
 
     @classmethod
     def draw(
-        cls, scene: Scene, count: int, times: Array, seed: int, mass_factors: Sequence[float]
+        cls, scene: Scene, count: int, times: Array, seeds: Sequence[int], mass_factors: Sequence[float]
     ) -> tuple[Scene, Starts]:
-        """Draw starts with a seed, and their parameters at some times; first the scene that has them."""
+        """Draw starts by seeds, and their parameters at some times; first the scene that has them."""
         environment = DQSpaceArmVectorEnv(count, scene)
-        environment.reset(seed=int(np.random.SeedSequence([RESERVED_SEED, seed]).generate_state(1)[0] >> 2))
+        sequence = np.random.SeedSequence([RESERVED_SEED, *seeds])
+        environment.reset(seed=int(sequence.generate_state(1)[0] >> 2))
         kernels, given = environment.kernels, environment.parameters
         if set(mass_factors) != {1.0}:
             scene, given = with_loads(scene, np.resize(mass_factors, count), given)

@@ -170,7 +170,7 @@ def episodes_case(scene: Scene) -> Case:
 
     copies, decisions = 128, 50
     times = decision_times(scene, decisions, crowding=0.8)
-    starts = Starts.draw(scene, copies, times, 0, (1.0,))[1]
+    starts = Starts.draw(scene, copies, times, [0], (1.0,))[1]
     kernels = compile_scene(scene)
     seen = kernels.observation(starts.states, np.full((copies, 1), times[-1]), starts.parameters)[0].shape[1]
     weights = random_weights([seen, 64, 64, kernels.n_u], np.random.default_rng(0))

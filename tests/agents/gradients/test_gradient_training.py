@@ -53,7 +53,7 @@ def test_decisions_are_divided_where_the_integration_errs(small_file, small_scen
 
 
 def test_constrained_episodes_decide_at_every_time_step_at_last(limited, small_file, small_scene):
-    """What violates a constraint for a moment may do so between decisions."""
+    """What violates a constraint for a moment may do so between decisions; starts are new ones then."""
     free, learner = (
         gradient_training._Learner(settings(small_file, updates=20), each) for each in (small_scene, limited)
     )
@@ -74,6 +74,11 @@ def test_constrained_episodes_decide_at_every_time_step_at_last(limited, small_f
     assert learner.effort()["environment_steps"] == 16 * (18 * 40 + steps)
     assert len(free._times) == 41
     assert free.effort()["environment_steps"] == 16 * 19 * 40
+    first = learner._starts.states
+    learner._update()
+    known = {row.tobytes() for row in (*free._starts.states, *first)}
+    assert len(known) == 256 + 16
+    assert known.isdisjoint(row.tobytes() for row in learner._starts.states)
 
 
 def settings(small_file, **algorithm):
