@@ -74,8 +74,7 @@ _announced: set[str] = set()
 def collector_paused() -> Iterator[None]:
     """Keep Python's garbage collector off.
 
-    A compiler keeps millions of objects to its end. The collector goes through them again and again, which is
-    a tenth of the time that the solver's loops take.
+    A compiler keeps millions of objects to its end, and the collector goes through them again and again.
     """
     was_on = gc.isenabled()
     gc.disable()

@@ -32,7 +32,7 @@ def compiled(loop: Loop) -> Loop:
     loop that allocates does not compile, and no time goes into counting references to arrays, which was a
     third of the backward pass. The interpreter lock is released.
     """
-    return _cached(njit(pipeline_class=_LoopCompiler, **_OPTIONS)(loop), loop)
+    return _cached(njit(**_OPTIONS)(loop), loop)
 
 
 def part(loop: Loop) -> Loop:
@@ -90,24 +90,7 @@ def is_prepared(loop: Callable[..., Any], *arguments: Any) -> bool:
     return signature in dispatcher.overloads or dispatcher._cache.holds(signature, dispatcher.targetctx)
 
 
-class _LoopLibrary(JITCodeLibrary):
-    """Code that is optimized once, as a whole; numba would begin with each of its functions by itself."""
-
-    def _optimize_functions(self, module: Any) -> None:
-        module.data_layout = cast(Any, self)._codegen._data_layout
-
-
-class _LoopCompiler(Compiler):
-    """Numba's compiler, but for repeated optimization."""
-
-    def compile_extra(self, function: Any) -> Any:
-        new_library = cast(Any, _LoopLibrary)
-        library = self.state.library = new_library(self.state.targetctx.codegen(), function.__name__)
-        library.enable_object_caching()
-        return Compiler.compile_extra(self, function)
-
-
-class _PartLibrary(_LoopLibrary):
+class _PartLibrary(JITCodeLibrary):
     """Code to link into that of others, as it was lowered."""
 
     def finalize(self) -> None:

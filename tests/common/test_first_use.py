@@ -1,5 +1,6 @@
 """What is said while code is compiled: a line on a terminal, a message for each scene, or nothing."""
 
+import gc
 import io
 import logging
 import re
@@ -56,6 +57,22 @@ def test_a_process_without_standard_error_compiles_in_silence(
     first_use.announce("scene 'paper'")
     with first_use.compiling(lambda: "step of scene 'paper'"):
         pass
+
+
+def test_the_collector_is_paused_meanwhile_and_goes_on_after_an_error() -> None:
+    was_on = []
+
+    def fail() -> None:
+        with first_use.compiling(lambda: "step of scene 'paper'"):
+            with first_use.compiling(lambda: "linearize of scene 'paper'"):
+                was_on.append(gc.isenabled())
+            was_on.append(gc.isenabled())
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert was_on == [False, False]
+    assert gc.isenabled()
 
 
 def test_a_short_wait_and_a_file_show_nothing(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
