@@ -113,20 +113,30 @@ def _emit_calls(
     functions: Mapping[str, ir.Function],
     blocks: Mapping[str, ir.Value],
 ) -> None:
-    """Emit the calls of a program on its blocks of vectors, with the loops around them."""
+    """Emit the calls of a program on its blocks of vectors, with the loops and guards around them."""
     builder = vectors.ir
-    begins, ends = ({getattr(loop, key): loop for loop in program.loops} for key in ("begin", "end"))
-    for position, call in enumerate(program.calls, start=1):
-        if position - 1 in begins:
-            repeated = kernel.append_basic_block("repeated")
-            builder.branch(repeated)
-            builder.position_at_end(repeated)
+    for position, call in enumerate(program.calls):
+        for guard in program.guards:
+            if guard.begin == position:
+                needed, passed = (kernel.append_basic_block(name) for name in ("needed", "passed"))
+                builder.cbranch(vectors.any_nonzero(blocks[guard.condition]), needed, passed)
+                builder.position_at_end(needed)
+        for loop in program.loops:
+            if loop.begin == position:
+                repeated = kernel.append_basic_block("repeated")
+                builder.branch(repeated)
+                builder.position_at_end(repeated)
         names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
         builder.call(functions[call.graph.name], [blocks[call.bindings.get(name, name)] for name in names])
-        if position in ends:
-            after = kernel.append_basic_block("after")
-            builder.cbranch(vectors.any_nonzero(blocks[ends[position].condition]), repeated, after)
-            builder.position_at_end(after)
+        for loop in program.loops:
+            if loop.end == position + 1:
+                after = kernel.append_basic_block("after")
+                builder.cbranch(vectors.any_nonzero(blocks[loop.condition]), repeated, after)
+                builder.position_at_end(after)
+        for guard in program.guards:
+            if guard.end == position + 1:
+                builder.branch(passed)
+                builder.position_at_end(passed)
 
 
 class _Arrays:

@@ -27,10 +27,10 @@ def append_cotangents(program: Program, of: Mapping[str, str], by: Sequence[str]
         by: Names of the inputs. The products are the buffers of these names with `COTANGENT`.
 
     Raises:
-        ValueError: The program has a loop, or no such inputs or buffers.
+        ValueError: The program has a loop or a guard, or no such inputs or buffers.
     """
-    if program.loops:
-        raise ValueError(f"program {program.name!r} has a loop, which has no reverse")
+    if not program.is_straight:
+        raise ValueError(f"program {program.name!r} has a loop or a guard, which has no reverse")
     sizes = program.scratch_sizes()
     for name in (*of, *of.values()):
         if name not in sizes:

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 from dq_space_arm_env.compiler.graph import Graph
 
@@ -71,6 +72,19 @@ class Loop:
     condition: str
 
 
+@dataclass(frozen=True)
+class Guard:
+    """A stretch of a program's calls that is passed over while no lane of a block needs it."""
+
+    begin: int  # its first call
+    end: int  # one past its last call
+    # Buffer of one scalar: the calls run if it is nonzero in some lane, then for all lanes of the block.
+    condition: str
+
+
+Stretch = TypeVar("Stretch", Loop, Guard)
+
+
 @dataclass
 class Program:
     """A sequence of calls."""
@@ -81,6 +95,7 @@ class Program:
     calls: list[Call] = field(default_factory=list)  # a buffer that is neither input nor output is scratch
     indexed: bool = False  # a list says which rows to work on
     loops: list[Loop] = field(default_factory=list)  # the buffers they touch live through all passes
+    guards: list[Guard] = field(default_factory=list)  # around single calls or whole loops
     held: set[str] = field(default_factory=set)  # buffers that derivatives take as constants, see `tangent`
 
     def call(self, graph: Graph, **bindings: str) -> None:
@@ -90,9 +105,13 @@ class Program:
     def append(self, other: Program, **buffers: str) -> None:
         """Append the calls of another program; `buffers` map names of its buffers to others."""
         begin = len(self.calls)
-        for loop in other.loops:
-            condition = buffers.get(loop.condition, loop.condition)
-            self.loops.append(Loop(begin + loop.begin, begin + loop.end, condition))
+
+        def moved(stretch: Stretch) -> Stretch:
+            condition = buffers.get(stretch.condition, stretch.condition)
+            return replace(stretch, begin=begin + stretch.begin, end=begin + stretch.end, condition=condition)
+
+        self.loops += map(moved, other.loops)
+        self.guards += map(moved, other.guards)
         self.held |= {buffers.get(name, name) for name in other.held}
         for call in other.calls:
             names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
@@ -108,10 +127,30 @@ class Program:
             raise ValueError(f"program {self.name!r}: a loop inside a loop")
         self.loops.append(Loop(begin, len(self.calls), condition))
 
+    @contextmanager
+    def only_where(self, condition: str) -> Iterator[None]:
+        """Run the calls appended inside only if `condition` is set in some lane of a block; see `Guard`.
+
+        What they alone write is arbitrary where they do not run.
+        """
+        begin = len(self.calls)
+        yield
+        if any(guard.end > begin for guard in self.guards):
+            raise ValueError(f"program {self.name!r}: a guard inside a guard")
+        self.guards.append(Guard(begin, len(self.calls), condition))
+
+    @property
+    def is_straight(self) -> bool:
+        """Whether all calls run once."""
+        return not self.loops and not self.guards
+
     @property
     def operation_count(self) -> int:
-        """Arithmetic operations per row over all calls; a loop counts once."""
-        return sum(call.graph.operation_count for call in self.calls)
+        """Arithmetic operations per row over all calls but guarded ones; a loop counts once."""
+        guarded = {number for guard in self.guards for number in range(guard.begin, guard.end)}
+        return sum(
+            call.graph.operation_count for number, call in enumerate(self.calls) if number not in guarded
+        )
 
     def scratch_sizes(self) -> dict[str, int]:
         """Number of vectors of every buffer, scratch included; ValueError if two calls disagree."""
@@ -155,6 +194,8 @@ class Program:
             span = (loops[number].begin, loops[number].end - 1) if number in loops else (number,)
             for name, _ in (*call.graph.inputs, *call.graph.outputs):
                 used.setdefault(call.bindings.get(name, name), []).extend(span)
+        for guard in self.guards:
+            used[guard.condition].append(guard.begin)
         for buffer in self.outputs:
             used.setdefault(buffer.name, [-1]).append(end)
         return {

@@ -45,7 +45,8 @@ def append_tangents(program: Program, by: Sequence[str], of: Sequence[str]) -> d
         order; None if it does not depend on them.
 
     Raises:
-        ValueError: The program has no such input or buffers, overwrites the input, or has tangents already.
+        ValueError: The program has no such input or buffers, overwrites the input, has tangents already, or
+            has a guard.
     """
     transformation = _Transformation(program, by, of)
     program.calls, program.loops = transformation.calls, transformation.loops
@@ -123,6 +124,8 @@ class _Transformation:
     def _check(self, of: Sequence[str]) -> None:
         program = self._program
         inputs = {buffer.name: buffer.dtype for buffer in program.inputs}
+        if program.guards:
+            raise ValueError(f"program {program.name!r} has a guard, which has no tangents")
         for name in self._by:
             if name not in inputs or inputs[name] == "bool":
                 raise ValueError(f"program {program.name!r} has no input {name!r} of float numbers")

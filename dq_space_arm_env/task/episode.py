@@ -106,12 +106,15 @@ def step(
     x_next: Scalars,
     u: Scalars,
     memory: Scalars,
+    unsound: Scalars,
+    worst: Scalars,
     checked_error: Scalars = (math.nan,),
     following: Scalars = (),
 ) -> Outputs:
     """Observation, reward, and end of the episode after a step from x to x_next, with its error.
 
-    Where the target passes waypoints, `following` is the next row of `given_path`.
+    `unsound` is whether the simulation `diverged`; `worst`, `most_cost`, is read only where the episode ends
+    early. Where the target passes waypoints, `following` is the next row of `given_path`.
     """
     scene = equations.scene
     steps, dt = scene.simulation.steps, scene.simulation.dt
@@ -127,8 +130,8 @@ def step(
     after = at_stage(equations, taken + 1.0, rest)
 
     # The episode ends at the scene's number of steps, or when the simulation diverges, which leaves it at the
-    # last sound state. NaN is not below any limit.
-    sound = total([entry * entry for entry in x_next]) <= STATE_LIMIT**2
+    # last sound state.
+    sound = casadi.logic_not(unsound[0])
     x_kept = [casadi.if_else(sound, new, old) for new, old in zip(x_next, x, strict=True)]
     at_end = casadi.logic_or(taken == steps - 1, casadi.logic_not(sound))
     terminated, finished, charges = at_end, sound, []
@@ -147,8 +150,7 @@ def step(
     # charged, so ending early never pays.
     stage = [*state_terms, before.effort(u), *before.twist_cost_terms(x, u)]
     terminal = [casadi.if_else(terminated, term, 0.0) for term in after.terminal_cost_terms(x_kept)]
-    worst = worst_cost(before, _every_phase(before), x, remaining)
-    reward = -casadi.if_else(finished, total(stage) + total(terminal), worst)
+    reward = -casadi.if_else(finished, total(stage) + total(terminal), worst[0])
 
     success = casadi.logic_and(finished, is_success(scene, errors))
     if caught:
@@ -160,6 +162,18 @@ def step(
         "report": [reward, *stage, *terminal, *errors, *caught, *checked_error, *charges],
         "flags": [terminated, success, casadi.logic_not(sound)],
     }
+
+
+def diverged(x_next: Scalars) -> Outputs:
+    """Whether a step has ended beyond all limits; NaN is not below any."""
+    return {"unsound": [casadi.logic_not(total([entry * entry for entry in x_next]) <= STATE_LIMIT**2)]}
+
+
+def most_cost(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:
+    """The most that the rest of an episode could cost, charged where it ends early."""
+    before = at_stage(equations, memory[0], memory[len(MEMORY) :])
+    remaining = equations.scene.simulation.steps - memory[0]
+    return {"worst": [worst_cost(before, _every_phase(before), x, remaining)]}
 
 
 def seen(equations: SceneEquations, x: Scalars, time_left: Scalar) -> dict[str, list[Scalar]]:

@@ -1,4 +1,4 @@
-"""Loops in programs: every lane goes through as many passes as it needs, and none more."""
+"""Loops and guards: every lane goes through as many passes as it needs; what no lane needs is passed over."""
 
 import casadi
 import numpy as np
@@ -6,8 +6,10 @@ import pytest
 
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.compiler.build import build_program
+from dq_space_arm_env.compiler.cotangent import append_cotangents
 from dq_space_arm_env.compiler.graph import trace
-from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.compiler.program import Buffer, Guard, Program
+from dq_space_arm_env.compiler.tangent import append_tangents
 
 
 def divisor():
@@ -54,3 +56,43 @@ def test_lanes_leave_a_loop_when_they_are_done(lanes):
     kernel.function(0, len(PAIRS), buffers.ctypes.data)
     np.testing.assert_array_equal(passes, PASSES)
     np.testing.assert_array_equal(common, np.gcd(*PAIRS.astype(int).T)[:, None] * [1, 1])
+
+
+def guarded():
+    """Tells which rows share a block with a negative number."""
+    program = Program("guarded", [Buffer("x", 1)], [Buffer("ran", 1)])
+    program.call(trace("guarded_begin", {"x": 1}, lambda x: {"is_negative": [x[0] < 0.0], "ran": [0.0]}))
+    with program.only_where("is_negative"):
+        program.call(trace("guarded_rest", {"x": 1}, lambda x: {"ran": [x[0] / x[0]]}))
+    return program
+
+
+@pytest.mark.parametrize("lanes", [1, 4, 8])
+def test_guarded_calls_run_for_blocks_with_a_lane_that_needs_them(lanes):
+    x = np.random.default_rng(0).uniform(-0.1, 1.0, size=61)
+    assert 0 < np.count_nonzero(x < 0.0) < len(x) // 4
+    kernel = native.NativeKernel("guarded", *build_program(guarded(), lanes))
+    ran = np.full(len(x), np.nan)
+    buffers = np.array([array.ctypes.data for array in (x, ran)], dtype=np.int64)
+    kernel.function(0, len(x), buffers.ctypes.data)
+    expected = [(x[first : first + lanes] < 0.0).any() for first in range(0, len(x), lanes)]
+    np.testing.assert_array_equal(ran, np.repeat(expected, lanes)[: len(x)])
+
+
+def test_guards_move_with_their_program_and_their_operations_do_not_count():
+    program = Program("whole", [Buffer("a", 1)], [Buffer("ran", 1)])
+    program.call(trace("whole_begin", {"a": 1}, lambda a: {"x": [2.5 * a[0]]}))
+    program.append(guarded(), is_negative="is_below")
+    assert program.guards == [Guard(2, 3, "is_below")]
+    assert program.operation_count == 2  # one product, one comparison, no quotient
+
+
+def test_guards_are_not_nested_and_have_no_derivatives():
+    program = guarded()
+    with pytest.raises(ValueError, match="'guarded': a guard inside a guard"):  # noqa: SIM117
+        with program.only_where("is_negative"):
+            program.append(guarded(), ran="ran_too")
+    with pytest.raises(ValueError, match="'guarded' has a loop or a guard, which has no reverse"):
+        append_cotangents(guarded(), {"ran": "x"}, ("x",))
+    with pytest.raises(ValueError, match="'guarded' has a guard, which has no tangents"):
+        append_tangents(guarded(), ("x",), ("ran",))

@@ -38,6 +38,11 @@ def run(function: Callable[..., Any], **inputs: Any) -> dict[str, np.ndarray]:
     return dict(zip([name for name, _ in graph.outputs], values, strict=True))
 
 
+def whole_step(equations: SceneEquations, x: Any, x_next: Any, u: Any, memory: Any, **error: Any) -> Any:
+    rare = {**episode.diverged(x_next), **episode.most_cost(equations, x, memory)}
+    return episode.step(equations, x, x_next, u, memory, **rare, **error)
+
+
 def moving(equations: SceneEquations) -> np.ndarray:
     x, layout = equations.layout.initial_state.copy(), equations.layout
     count = layout.n_x - layout.state.pose.stop
@@ -115,13 +120,13 @@ def test_a_step_pays_for_its_stage_and_at_the_end_for_where_it_ends(
     x_next, u = moving(equations), 0.3 * layout.control_limit
     before = state_costs(equations, x, terminal=False)
     given = {"x": x, "x_next": x_next, "u": u, "memory": [taken, *before]}
-    done = run(partial(episode.step, equations), **given)
+    done = run(partial(whole_step, equations), **given)
     effort = float(layout.control_weight @ u**2)
     terminal = state_costs(equations, x_next, terminal=True) if over else [0.0, 0.0]
     reward = -sum(before) - effort - sum(terminal)
     expected = [reward, *before, effort, *terminal, *shown_errors(equations, x_next), np.nan]
     np.testing.assert_allclose(done["report"], expected, rtol=1e-9)
-    told = run(partial(episode.step, equations), **given, checked_error=[0.25])
+    told = run(partial(whole_step, equations), **given, checked_error=[0.25])
     assert told["report"][-1] == 0.25
     assert done["flags"].tolist() == [over, False, False]
     assert done["observation"][-1] == pytest.approx((STEPS - taken - 1) * DT)
@@ -139,7 +144,7 @@ def test_a_step_to_what_is_no_state_stays_and_pays_for_all_that_is_left(
     x_next[layout.state.joint_angles.start] = entry
     before, effort = state_costs(equations, x, terminal=False), float(layout.control_weight @ u**2)
     given = {"x": x, "x_next": x_next, "u": u, "memory": [taken, *before]}
-    done = run(partial(episode.step, equations), **given)
+    done = run(partial(whole_step, equations), **given)
     terminal = state_costs(equations, x, terminal=True)
     reward = -float(casadi.DM(worst_cost(equations, [equations], x.tolist(), STEPS - taken)))
     assert reward < -(STEPS - taken) * (sum(before) + effort) - sum(terminal)

@@ -7,6 +7,7 @@ input, `parameters`; a scene in which nothing does has no such input.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -104,12 +105,28 @@ class EnvironmentPrograms:
         method = checked_integrator_of(simulation, integrator)
         stepper = actuated(method or integrator_of(simulation, integrator), equations.field)
         stepper.append_step(program, equations.field)
-        sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory}
+        program.call(trace("diverged_graph", {"x_next": n_x}, episode.diverged))
+        self._append_most_cost(program, n_memory)
+        sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory, "unsound": 1, "worst": 1}
         sizes |= ({"checked_error": 1} if method else {}) | following
         report = trace("report_graph", sizes, partial(episode.step, equations), parameters=self._parameters)
-        program.call(report, **({"parameters": EPISODE} if self.scene.phases else {}))
+        program.call(report, **self._episode)
         program.outputs = _outputs(report)
         return program
+
+    def _append_most_cost(self, program: Program, n_memory: int) -> None:
+        """What is charged where an episode ends early; if only divergence ends it, computed only then."""
+        n_x = self.equations.field.n_x
+        most = partial(episode.most_cost, self.equations)
+        graph = trace("worst_graph", {"x": n_x, "memory": n_memory}, most, parameters=self._parameters)
+        violations_end = any(each.terminates for each in self.scene.constraints)
+        with nullcontext() if violations_end else program.only_where("unsound"):
+            program.call(graph, **self._episode)
+
+    @property
+    def _episode(self) -> dict[str, str]:
+        """Where graphs find the parameters of the episode's start."""
+        return {"parameters": EPISODE} if self.scene.phases else {}
 
 
 EPISODE = "episode_parameters"
