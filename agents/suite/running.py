@@ -96,8 +96,16 @@ class Score:
             "action_seconds": float(np.median([each["action_seconds"] for each in summaries])),
             "planning_seconds": self.rows[0].facts["planning_seconds"],
             "training_seconds": mean("training_seconds"),
+            "training_commits": self._commits or None,  # a folder may hold trainings of an earlier one
             "commands": [row.facts["evaluation_command"] for row in self.rows],
         }
+
+    @property
+    def _commits(self) -> list[str]:
+        """Hashes of the commits that the policies were trained at, as far as they tell, sorted."""
+        origins = [row.evaluation.metadata.get("provenance") or {} for row in self.rows]
+        commits = [origin.get("commit") or {} for origin in origins]
+        return sorted({str(commit["hash"]) for commit in commits if "hash" in commit})
 
     @property
     def _shares(self) -> NDArray[np.float64]:

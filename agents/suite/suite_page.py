@@ -39,6 +39,7 @@ _SCORES = (
     replace(COLUMNS["median_cost_gap"], key="interquartile_mean_cost_gap"),
     Column("tail", "95th perc.\n%", lambda gap: f"{100.0 * gap:.3g}"),
     *(COLUMNS["violating_episodes"], *_TIMES),
+    Column("training_commits", "trained\nat", lambda hashes: ", ".join(each[:7] for each in hashes)),
 )
 _MEASURES = ("success_rate", "violating_episodes", "interquartile_mean_cost_gap")
 _SAME = {"name", "starts", "receding_starts", "conditions", "limits", "tasks"}

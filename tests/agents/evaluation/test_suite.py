@@ -296,6 +296,22 @@ def test_scores_by_hand(content):
     assert row["within_0.01"][0] == pytest.approx((4 / 8 + 0.0) / 2)
 
 
+def test_the_page_tells_at_which_commits_policies_were_trained(content):
+    score = made([[True]] * 4, [[0.0]] * 4)
+    origins = [{"commit": {"hash": "b" * 40}}, {"commit": {"hash": "a" * 40}}, {"commit": None}, None]
+    rows = tuple(
+        replace(row, evaluation=replace(row.evaluation, metadata={"provenance": origin}))
+        for row, origin in zip(score.rows, origins, strict=True)
+    )
+    suite = Suite.model_validate(content)
+    run = SuiteRun(suite, (replace(score, rows=rows), replace(score, entrant="y")), {"a": ""}, ())
+    page = suite_page(run, picture=False)
+    known, unknown = page.record["parts"]["tasks"]["scores"]
+    assert known["training_commits"] == ["a" * 40, "b" * 40]
+    assert unknown["training_commits"] is None
+    assert "| aaaaaaa, bbbbbbb |" in page.markdown()
+
+
 def test_a_check_tells_equal_from_like_and_other(content, tmp_path):
     suite, file = Suite.model_validate(content), tmp_path / "theirs.json"
 
