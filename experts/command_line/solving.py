@@ -124,6 +124,9 @@ def save(run: SolveRun, folder: Path, *, figures: bool) -> list[Path]:
 
         maneuver = Maneuver(run.start.episode_scene, run.solution.states, run.solution.controls)
         files += write_figures(maneuver, folder)
+    else:
+        for figure in folder.glob("figure-[2-6]-*.png"):
+            figure.unlink()  # of an earlier run: it shows another trajectory
     return files
 
 

@@ -18,8 +18,8 @@ COPIES = 1024
 _REPEATS, _SAMPLE_SECONDS = 7, 0.05
 _SOLVES = 3
 REFERENCE = {
-    "environment's step": 2.6e-6,
-    f"step of {COPIES} environments, each": 2.0e-7,
+    "environment's step": 2.4e-6,
+    f"step of {COPIES} environments, each": 1.8e-7,
     f"integration step of {COPIES} states, each": 1.4e-7,
     f"its derivatives for {COPIES} states, each": 1.4e-6,
     "iteration of the expert": 1.2e-2,

@@ -80,6 +80,17 @@ def test_solve_prints_table_or_json(
     assert "solution.npz, scene.yaml, summary.json" in table
 
 
+def test_figures_of_an_earlier_run_do_not_stay_beside_another_solution(
+    scene_file: str, tmp_path: Path
+) -> None:
+    mine, old = tmp_path / "figure-1-mine.png", tmp_path / "figure-3-pose-error.png"
+    for file in (mine, old):
+        file.write_bytes(b"")
+    assert main(["solve", scene_file, "--solver", "box", "--out", str(tmp_path)]) == SUCCESS
+    assert mine.exists()
+    assert not old.exists()
+
+
 def test_what_has_not_converged_is_saved_and_said(
     scene_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
