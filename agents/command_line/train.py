@@ -98,6 +98,7 @@ def train(
 
 def _train_one(checked: AgentConfiguration, out: Path | None, as_json: bool) -> int:
     from agents import training
+    from agents.run_folder import learned
     from dq_space_arm_env.common.progress import ProgressDisplay
 
     folder = out or training.default_folder(checked)
@@ -107,12 +108,16 @@ def _train_one(checked: AgentConfiguration, out: Path | None, as_json: bool) -> 
     if not finished:
         with keeping(kept), ProgressDisplay(message_console()) as shown:
             training.train(checked, folder, report=shown.update)
+    curve = learned(folder)
+    reached = curve[-1]["success_rate"] if curve else None
     if as_json:
         facts = {"agent": checked.name, "seed": checked.seed, "folder": str(folder)}
-        print_document({**facts, "policy": str(folder / "policy.npz")})
+        print_document({**facts, "policy": str(folder / "policy.npz"), "success_rate": reached})
     else:
         before = "finished before, and not trained again; " if finished else ""
-        table_console().print(f"{folder}: {before}the policy is in policy.npz", markup=False, soft_wrap=True)
+        after = "" if reached is None else f"; success from {reached:.0%} of the validation starts"
+        said = f"{folder}: {before}the policy is in policy.npz{after}"
+        table_console().print(said, markup=False, soft_wrap=True)
     return SUCCESS
 
 

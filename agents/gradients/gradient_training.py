@@ -181,7 +181,8 @@ class _Learner:
             done = self._updates
             if done % BETWEEN_MESSAGES == 0:
                 left = self._seconds * (total - done) / max(1, done)
-                line = f"{done} of {total} updates, median cost {cost:.5g}"
+                reached = f", success {curve[-1]['success_rate']:.0%}" if curve else ""
+                line = f"{done} of {total} updates, median cost {cost:.5g}{reached}"
                 report(Status(done, total, f"{line}, {timedelta(seconds=round(left))} left"))
             if done % progression.evaluate_every == 0 or done == total:
                 found = validate(self.export({}), self._scene, seeds)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from agents.policies import ExportedPolicy
 from agents.policies.chunking import ChunkingPolicy, load_exported
 from agents.policies.flying import Policy
-from agents.run_folder import POLICY
+from agents.run_folder import CONFIGURATION, POLICY
 from agents.zoo.model_archive import (
     ModelArchiveError,
     NeedsCodeError,
@@ -248,6 +248,10 @@ def read_policy(path: Path, *, trust: bool = False, normalized: bool = False) ->
     A model that was trained on normalized observations is refused unless the caller normalizes them.
     """
     if not path.exists():
+        if path.name == POLICY and (path.parent / CONFIGURATION).exists():
+            raise PolicyError(
+                f"{path.parent}: this training has no policy yet; run its command again to finish it"
+            )
         raise PolicyError(f"{path}: there is no such file or folder")
     if path.suffix == ".npz":
         return load_exported(path)

@@ -18,12 +18,24 @@ from typing import Any, Literal
 
 from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.algebra import dual_quaternion, poses, rotations
-from dq_space_arm_env.command_line.scene_warnings import arm_length, warnings_of, way_to_target
+from dq_space_arm_env.command_line.scene_warnings import (
+    arm_length,
+    tip_directions,
+    warnings_of,
+    way_to_target,
+)
 from dq_space_arm_env.common.files import json_value
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.step_stability import joint_motion
 from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_wheels
 from dq_space_arm_env.interoperability.exporting import joint_limits
-from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps, needs_stiff_method
+from dq_space_arm_env.interoperability.step_choice import (
+    ACCURACY,
+    StepTrial,
+    best_of,
+    measured_steps,
+    needs_stiff_method,
+)
 from dq_space_arm_env.interoperability.urdf_arm import HERE, UrdfTree
 from dq_space_arm_env.interoperability.urdf_elements import read_robot
 from dq_space_arm_env.scene import Link, Simulation, Success
@@ -45,6 +57,7 @@ _OPTIONS = {
 
 _MOST_ENDS = 12  # of arms that are listed
 _TOLERANCE = 0.1  # most of the position at the end, relative to the length of the arm
+_WAY = 0.25  # likewise, relative to the way to the target
 
 
 @dataclass(frozen=True)
@@ -116,8 +129,15 @@ def import_urdf(
         scene = with_jets(scene, 0.5 * max(scene.actuators.base_force.limit))
     scene = scene.replace(spread=_spread(scene, proposals.spread), success=_success(scene))
     steps = tuple(measured_steps(scene)) if proposals.measured else ()
-    scene = steps[-1].of(scene) if steps else scene
-    messages = (str(each.message).removeprefix("URDF: ") for each in caught)
+    messages = [str(each.message).removeprefix("URDF: ") for each in caught]
+    if steps:
+        best = best_of(steps)
+        scene = best.of(scene)
+        if best.error > ACCURACY:
+            messages.append(
+                f"simulation: the best steps that were tried end {best.error:.0e} m or rad off, where "
+                f"{ACCURACY:.0e} was asked: --lock JOINT and --lock-branches hold joints that are not needed"
+            )
     written = {joint.child: joint.effort for joint in read_robot(path).joints.values()}
     efforts = tuple(written[link.name] if link.actuated else None for link in scene.links)
     added = (arguments.get("spacecraft") or {}).get("mass", 0.0)
@@ -125,25 +145,28 @@ def import_urdf(
 
 
 def _spread(scene: Scene, width: float) -> dict[str, float]:
-    """Draws of the start: the joints within their limits, the base where thrusters can bring it back."""
+    """Draws of the start: the joints within their limits, the base where anything makes up for it."""
     angles = scene.initial_state.joint_angles
     room = min(
         min(angle - lower, upper - angle)
         for angle, (lower, upper, _) in zip(angles, joint_limits(scene), strict=True)
     )
-    pushed = scene.actuators.base_force or scene.actuators.thrusters
+    actuators = scene.actuators
+    pushed = actuators.base_force or actuators.thrusters
+    turned = pushed or actuators.base_torque or actuators.wheels or tip_directions(scene) == 6
     return {
         "joint_angles": min(width, float(f"{0.95 * room:.2g}")),  # two digits add less than 5 %
-        "base_rotation": width,
+        "base_rotation": width if turned else 0.0,
         "base_position": width if pushed else 0.0,
     }
 
 
 def _success(scene: Scene) -> dict[str, float]:
-    """A tolerance in proportion to the arm from its first joint on, but no more than the usual one."""
+    """A tolerance in proportion to the arm from its first joint on and to its way, at most the usual one."""
     length = arm_length(scene) - math.hypot(*scene.links[0].joint.position)
-    usual = Success().position_error
-    return {"position_error": min(usual, float(f"{_TOLERANCE * length:.1g}") or usual)}
+    usual, (_, meters) = Success().position_error, way_to_target(scene)
+    most = min(_TOLERANCE * length, _WAY * meters or math.inf)
+    return {"position_error": min(usual, float(f"{most:.1g}") or usual)}
 
 
 def mounted(position: tuple[float, ...] | None, degrees: tuple[float, ...] | None) -> dict[str, Any]:
@@ -222,6 +245,13 @@ def _lines(imported: Imported, file: str) -> Iterator[str]:
     share = f", {part} kg of it the spacecraft's" if imported.spacecraft and part != whole else ""
     yield f"  base    {whole} kg{share}"
     yield f"  links   {links}"
+    tree = KinematicTree.from_scene(scene)
+    beside = [link.name for i, link in enumerate(scene.links) if i not in tree.path_to(tree.tip_body)]
+    if beside:
+        yield (
+            f"  beside  the way to the tip {len(beside)} more move: {', '.join(beside)}; --lock-branches "
+            "holds all, --lock JOINT one"
+        )
     yield f"  limits  {'; '.join(_limits(scene)) or 'no motors'}; edit actuators and links"
     yield from _scaled(imported)
     limits_of_joints = joint_limits(scene)
@@ -274,14 +304,14 @@ def _steps(imported: Imported) -> Iterator[str]:
     """Say what was measured of integrators and time steps, and what stiff dampers mean."""
     scene, simulation = imported.scene, imported.scene.simulation
     if imported.steps:
-        dt = simulation.dt * imported.steps[-1].division
+        dt = simulation.dt * best_of(imported.steps).division
         words = [
             f"{each.integrator} of {1e3 * dt / each.division:.3g} ms "
             + (f"ends {each.error:.0e} m or rad off" if math.isfinite(each.error) else "diverges")
             for each in imported.steps
         ]
-        taken = "this is" if len(words) == 1 else "the last one is"
-        yield f"  steps   a swing by {'; by '.join(words)}: {taken} taken"
+        taken = "this" if len(words) == 1 else f"{simulation.integrator} of {1e3 * simulation.dt:.3g} ms"
+        yield f"  steps   a swing by {'; by '.join(words)}: {taken} is taken"
     elif simulation.integrator != Simulation().integrator:
         yield f"  steps   by {simulation.integrator}: the joints' dampers are too stiff for others"
     slower = simulation.integrator != Simulation().integrator or simulation.dt < Simulation().dt

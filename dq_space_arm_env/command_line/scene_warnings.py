@@ -20,6 +20,8 @@ from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.task.constraint_residuals import state_residuals
 from dq_space_arm_env.task.equations import SceneEquations
 
+_BASE_DIRECTIONS = 6  # columns of a Jacobian
+_SMALL = 1e-3  # rad and m per rad and m, of the least direction of a tip that counts
 _FAR = 50.0  # m, between a joint and the next: no arm in space is as long
 _ROUNDS = 4.0 * math.pi  # rad, of angles and their limits
 _FAST = 50.0  # rad/s
@@ -80,7 +82,9 @@ def _masses(scene: Scene) -> Iterator[str]:
     bodies = [("base", scene.base)] + [(f"links[{i}]", link) for i, link in enumerate(scene.links)]
     for place, body in bodies:
         if body.mass < _LIGHT:
-            light.append((f"{place}.mass", f"{1e3 * body.mass:g} g: was it meant in other units than kg?"))
+            whose = f" of {body.name!r}" if isinstance(body, Link) else ""
+            sentence = f"{1e3 * body.mass:g} g{whose}: was it meant in other units than kg?"
+            light.append((f"{place}.mass", sentence))
         gyration = math.sqrt(np.trace(np.array(body.inertia)) / (2.0 * body.mass))
         size = f"of a body of {body.mass:g} kg that is"
         # A link may be longer than the arm, as a panel: its center of mass is then far from its joint.
@@ -243,3 +247,11 @@ def arm_length(scene: Scene) -> float:
             length += slide * max(abs(bound) for bound in limits[body - 1][:2])  # infinite for no limit
         body = scene.parent_bodies[body - 1]
     return length
+
+
+def tip_directions(scene: Scene) -> int:
+    """In how many directions joints and wrist can move the tip at the start, turns included: 6 at most."""
+    tree, layout, start = KinematicTree.from_scene(scene), StateLayout.of(scene), scene.initial_state
+    angles = tree.coordinates(layout.initial_state[layout.state.joint_angles].tolist())
+    columns = kinematics.tip_jacobian(tree, angles, start.wrist_angles or (0.0, 0.0, 0.0))[_BASE_DIRECTIONS:]
+    return int(np.linalg.matrix_rank(np.array(columns), tol=_SMALL)) if columns else 0

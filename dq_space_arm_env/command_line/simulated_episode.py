@@ -112,7 +112,8 @@ def read_noise(texts: Sequence[str], scene: Scene) -> NDArray[np.float64]:
         name, mark, number = text.rpartition("=")
         if mark and name not in present:
             known = ", ".join(f"{each} [{_units(layout, each)}]" for each in present)
-            hint = did_you_mean(name, present)
+            alike = [each for each in present if each.rpartition("_")[2] == name.rpartition("_")[2]]
+            hint = did_you_mean(name, alike or present)
             raise ValueError(f"--noise {text}: {hint}the actuators of scene {scene.name} are {known}")
         unit = f"standard deviation, {_units(layout, name)}" if mark else "fraction of the limits"
         try:

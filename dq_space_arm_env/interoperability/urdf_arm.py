@@ -327,7 +327,7 @@ def arm_of(
     of_bodies: list[dict[str, Pose]] = [
         {name: dual_quaternion.multiply(to_center, pose) for name, pose in placed.items()}
     ]
-    joints = []
+    joints, massless = [], list[str]()
     for joint in moving:
         turned = _turned_to(joint.axis)
         parent = next(index for index, links in enumerate(of_bodies) if joint.parent in links)
@@ -337,12 +337,17 @@ def arm_of(
         of_bodies.append(placed)
         moved = lumped(_bodies(robot, placed))
         if moved is None:
-            raise SceneError(
-                f"URDF: link {joint.child!r}, moved by joint {joint.name!r}, has no mass, nor has anything "
-                "fixed to it: its accelerations would be infinite; give it a mass and an inertia"
-            )
+            massless.append(f"link {joint.child!r}, moved by joint {joint.name!r}")
+            continue
         moved = _checked(robot, placed, moved, joint.child, balance, flaws)
         joints.append(ArmJoint(joint, parent, pose, moved))
+    if massless:
+        one = len(massless) == 1
+        lacking = "has no mass, nor has anything fixed to it: its" if one else "have no masses: their"
+        raise SceneError(
+            f"URDF: {'; '.join(massless)}, {lacking} accelerations would be infinite; give a mass and an "
+            "inertia, <inertial>"
+        )
     at_center = Body(body.mass, np.zeros(3), body.inertia)
     way = len(chain)
     return Arm(at_center, base, center, tuple(joints), way, of_bodies[way][tip], tuple(flaws))

@@ -251,6 +251,9 @@ def test_noise_in_units_of_the_actuators() -> None:
     scene = load_scene("no-wrist").replace({"links.1.torque_limit": 0.5})
     assert read_noise([], scene).tolist() == [0.0] * 9
     assert read_noise(["0.1"], scene).tolist() == [0.1] * 9
+    wheels = load_scene("wheels")
+    with pytest.raises(ValueError, match="--noise base_torque=1: did you mean 'wheel_torque'"):
+        read_noise(["base_torque=1"], wheels)
     found = read_noise(
         ["joint_torque=0.02", "0.1", "base_force=2.5"], scene
     )  # N m and N, of 2, 0.5, 2 and 10

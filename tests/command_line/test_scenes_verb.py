@@ -214,10 +214,10 @@ NEAR = {
         ({"links.1.inertia": [300, 300, 200]}, r"links\[1\].inertia: .* kg that is .* m wide, .* 2.4 m long"),
         (
             {f"links.{i}.mass": 0.004 for i in range(3)},
-            r"links\[0\].mass: 4 g: .* kg\? Likewise links\[1\].mass, links\[2\].mass$",
+            r"links\[0\].mass: 4 g of 'link 1': .* kg\? Likewise links\[1\].mass, links\[2\].mass$",
         ),
         ({"spread.joint_angles": 10}, r"spread: draws of angles by more than half a turn, rad: degrees\?"),
-        ({"links.0.mass": 0.004}, r"links\[0\].mass: 4 g: was it meant in other units than kg\?"),
+        ({"links.0.mass": 0.004}, r"links\[0\].mass: 4 g of 'link 1': was it meant in other units than kg\?"),
         ({"links.0.mass": 5e9}, r"links\[0\].inertia: .* 5e\+09 kg that is 0.0039 mm wide: a mass in grams"),
         ({"links.0.inertia": [5e4, 5e4, 5e4]}, r"links\[0\].inertia: .* 5 kg that is 122 m wide, .*kg mm\^2"),
         ({"links.2.torque_limit": 900}, "torque limits: 900 N m of 'link 3', [0-9]+ times what a swing"),

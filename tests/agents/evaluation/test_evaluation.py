@@ -526,6 +526,9 @@ def test_policies_fly_in_the_scene_that_they_were_trained_in(tmp_path, capsys, m
 def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
     assert main(["evaluate", str(tmp_path / "policy.npz"), "--no-expert"]) == 2
     assert "there is no such file or folder" in capsys.readouterr().err
+    (tmp_path / "config.yaml").write_text("name: begun\n")
+    assert main(["evaluate", str(tmp_path), "--no-expert"]) == 2
+    assert f"{tmp_path}: this training has no policy yet; run its command again" in capsys.readouterr().err
     (tmp_path / "damaged.npz").write_bytes(b"nothing")
     assert main(["evaluate", "--policy", str(tmp_path / "damaged.npz"), "--no-expert"]) == 1
     assert "cannot be read as a policy" in capsys.readouterr().err
