@@ -168,17 +168,22 @@ class _Search:
 
     def _tasks(self) -> Iterator[TrainingTask]:
         from optuna import Trial
-        from optuna.samplers import TPESampler
         from optuna.trial import TrialState
 
         interrupted = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
-        for trial in interrupted:
+        for trial in interrupted:  # some may lack values
+            self._seed(trial.number)
             yield from self._begin(Trial(self._study, trial._trial_id))
         while (number := len(self._study.get_trials(deepcopy=False))) < self._trials:
-            # Seeded by the trial: a resumed search does not repeat what it began with.
-            seed = np.random.SeedSequence([self._configuration.seed, number]).generate_state(1)[0]
-            self._study.sampler = TPESampler(seed=int(seed))
+            self._seed(number)
             yield from self._begin(self._study.ask())
+
+    def _seed(self, number: int) -> None:
+        """Seed the sampler by the trial: a resumed search does not repeat what it began with."""
+        from optuna.samplers import TPESampler
+
+        seed = np.random.SeedSequence([self._configuration.seed, number]).generate_state(1)[0]
+        self._study.sampler = TPESampler(seed=int(seed))
 
     def _begin(self, trial: optuna.Trial) -> Iterator[TrainingTask]:
         """The training of a trial; none where its values do not go together."""

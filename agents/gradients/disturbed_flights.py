@@ -58,7 +58,7 @@ def arrivals(
     """Which outputs act in the decisions of B episodes.
 
     Flights hold each action for a time step: on average over a decision, they act with the output of half
-    a step before its middle. Without delays, the first decisions of phases extrapolate nothing.
+    a step before its middle. From the first decision of a phase nothing is extrapolated.
 
     Args:
         times: Those of the decisions and of the end, s, shape (K + 1,).
@@ -76,6 +76,8 @@ def arrivals(
         wanted -= delays
         newest = np.minimum(np.searchsorted(times, wanted), own)
         before = np.maximum(newest - 1, 0)
+        begun = (wanted > times[newest]) & np.isin(newest, firsts)
+        before[begun] = newest[begun]
     between = times[newest] - times[before]
     ahead = np.where(between > 0.0, wanted - times[newest], 0.0) / np.where(between > 0.0, between, 1.0)
     arrived = (wanted >= 0.0) | (delays is None)

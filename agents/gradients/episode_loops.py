@@ -153,7 +153,7 @@ def trace_back_decisions(
         _add(slopes.by_state[k], slopes.by_observed)
         for i in range(count):
             if slopes.lost[i]:
-                slopes.by_state[k, i, :] = 0.0
+                slopes.by_state[k, i, :] = np.nan  # no usual slope; `_shorten` makes it zero
         _shorten(slopes.by_state[k], steep, usual, slopes.sizes, slopes.ordered)
 
 

@@ -153,8 +153,8 @@ class Episodes:
         self._arrivals = arrivals(times, dt, firsts, count)
 
     def follow_on(self, others: Episodes) -> None:
-        """Take the penalties that others of the same scene have come to."""
-        self.roughness = others.roughness
+        """Take the penalties that others of the same scene have come to, and their shares of an actuator."""
+        self.roughness, self._relative = others.roughness, others._relative
         self.penalties.prices[:], self.penalties.cost = others.penalties.prices, others.penalties.cost
 
     def divide(self, substeps: Array) -> None:
@@ -249,7 +249,9 @@ class Episodes:
         }
 
     def meet(self, met: Met) -> None:
-        """Let delays, jumps and noise disturb the next flights."""
+        """Let delays, jumps and noise disturb the next flights; ValueError for noise on flights without."""
+        if met.noise is not None and self._measured is self._states:
+            raise ValueError("noise: these episodes are made without it, should be made with noisy=True")
         count = self._states.shape[1]
         self._met, self._arrivals = met, arrivals(self._times, self._dt, self._firsts, count, met.delays)
         self._usual = USUAL_DISTURBED

@@ -133,7 +133,10 @@ class Penalties:
         self._follow(self._ends, residuals[:, self._first_end :][:, :count], AT_END)
 
     def _follow(self, rows: slice, worst: Array, ascent: _Ascent) -> None:
-        """Let the prices of rows follow the largest residuals of episodes, (B, r)."""
+        """Let the prices of rows follow the largest residuals of episodes, (B, r), but of lost ones."""
+        worst = worst[~np.isnan(worst).any(axis=1)]
+        if not len(worst):
+            return
         charged, close, allowed, most, fastest, dearest = ascent
         relative = worst / self._tolerances[rows]
         violating = np.minimum((relative > charged).mean(axis=0), most)

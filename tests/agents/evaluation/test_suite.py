@@ -16,13 +16,15 @@ from agents.evaluation.comparing import Row
 from agents.evaluation.evaluating import Evaluation
 from agents.evaluation.expert_costs import OptimalCosts
 from agents.policies.flying import Flights
+from agents.run_folder import DivergedError
 from agents.suite import Score, Suite, SuiteError, SuiteRun, list_suites, load_suite, run_suite
 from agents.suite.running import _from_files, _missing, entrant_names
 from agents.suite.suite_page import check, check_columns, comparable, overall_rows, suite_page
 from agents.zoo.finding import PolicyError
 from agents.zoo.shelf import load_policy
 from dq_space_arm_env import load_scene
-from dq_space_arm_env.common.console import UNUSABLE
+from dq_space_arm_env.command_line import main
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, UNUSABLE
 from dq_space_arm_env.common.tables import tabulate
 from experts.demonstrations import SerialExecutor
 
@@ -393,6 +395,10 @@ def test_a_suite_whose_trainings_all_failed_has_a_page(content, tmp_path):
     assert page.shortcomings == ["The training failed."]
 
 
+def diverge(*_, **__):
+    raise DivergedError("flights cost too much")
+
+
 @pytest.mark.slow
 @pytest.mark.agents
 def test_the_verb_writes_page_and_json_and_tells_a_failed_training(content, cache, tmp_path, monkeypatch):
@@ -402,12 +408,16 @@ def test_the_verb_writes_page_and_json_and_tells_a_failed_training(content, cach
     file, out = tmp_path / "suite.yaml", tmp_path / "out"
     file.write_text(json.dumps(content))
     verb = ["--suite", str(file), "--out", str(out), "--seeds", "1", "--workers", "1"]
-    done = CliRunner().invoke(suite_verb, ["tiny", *verb], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
+    assert main(["suite", "tiny", *verb]) == SUCCESS
     assert {path.name for path in out.glob("suite.*")} == {"suite.html", "suite.json", "suite.md"}
     record = json.loads((out / "suite.json").read_text())
     assert len(record["parts"]["tasks"]["scores"]) == 2
     assert "plan with gains" not in (out / "suite.md").read_text()
+    monkeypatch.setattr("agents.experiments.training_task.train", diverge)
+    assert main(["suite", "tiny", *verb, "--seeds", "2"]) == FAILURE
+    record = json.loads((out / "suite.json").read_text())
+    assert [score["runs"] for score in record["parts"]["tasks"]["scores"]] == [1, 1]
+    assert "The training of tiny-task-1, seed 1, failed: flights cost" in (out / "suite.md").read_text()
     (out / "suite.md").unlink()
     with pytest.raises(SuiteError, match="is not the JSON file of a suite"):  # before anybody flies
         CliRunner().invoke(suite_verb, ["tiny", *verb, "--check", str(file)], catch_exceptions=False)

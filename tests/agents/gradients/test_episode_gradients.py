@@ -310,18 +310,39 @@ def test_prices_of_success_follow_where_judged_episodes_end(small_scene):
     np.testing.assert_allclose(loose.episodes.penalties.prices, [math.exp(0.038), math.exp(-0.002)])
 
 
-def test_an_episode_that_diverges_does_not_count(small_scene):
+@pytest.mark.parametrize("lost", [1, COUNT // 2 + 1])
+def test_episodes_that_diverge_do_not_count(small_scene, lost):
     calm, wild = Flown(small_scene), Flown(small_scene)
-    calm.states[-1] = calm.states[0]
-    wild.states[-1] = wild.states[0]
+    calm.states[-lost:] = wild.states[-lost:] = calm.states[0]
     velocities = wild.episodes._kernels.layout.state.joint_rates
-    wild.states[-1, velocities] = 1e6
+    wild.states[-lost:, velocities] = 1e6
     expected = [each.astype(np.float64) * COUNT for each in calm.gradient()[0]]
-    calm.states[:-1] = calm.states[0]  # what the last one adds
-    alone = [each.astype(np.float64) for each in calm.gradient()[0]]
-    found = [each.astype(np.float64) * (COUNT - 1) for each in wild.gradient()[0]]
-    for whole, one, rest in zip(expected, alone, found, strict=True):
-        np.testing.assert_allclose(rest, whole - one, rtol=1e-3, atol=1e-4 * np.abs(whole).max())
+    calm.states[:-1] = calm.states[0]  # what a lost one adds
+    alone = [each.astype(np.float64) * lost for each in calm.gradient()[0]]
+    found = [each.astype(np.float64) * (COUNT - lost) for each in wild.gradient()[0]]
+    for whole, added, rest in zip(expected, alone, found, strict=True):
+        np.testing.assert_allclose(rest, whole - added, rtol=1e-3, atol=1e-4 * np.abs(whole).max())
+
+
+def test_diverged_episodes_leave_prices_to_the_others(limited):
+    flown = Flown(limited)
+    flown.costs()
+    penalties, p = flown.episodes.penalties, flown.episodes.parameters
+    ends = np.repeat(flown.states[:1], COUNT, axis=0)
+    penalties.prices[:] = 1.0
+    penalties.follow_ends(np.full_like(ends, np.nan), p)
+    assert (penalties.prices == 1.0).all()
+    penalties.follow_ends(ends, p)
+    expected = penalties.prices.copy()
+    penalties.prices[:] = 1.0
+    ends[0] = np.nan
+    penalties.follow_ends(ends, p)
+    np.testing.assert_array_equal(penalties.prices, expected)
+
+
+def test_noise_is_refused_by_episodes_made_without(small_scene):
+    with pytest.raises(ValueError, match=r"noise: .* should be made with noisy=True"):
+        Flown(small_scene).meet(MISMATCH.model_copy(update={"noise": 0.02}))
 
 
 @pytest.mark.parametrize("phased", [False, True])

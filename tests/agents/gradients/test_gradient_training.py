@@ -166,6 +166,9 @@ def test_units_follow_the_inputs_and_leave_the_policy(small_file, small_scene):
     sizes = learner._episodes.sizes()
     np.testing.assert_allclose(learner._episodes.units, 4.0 * sizes, rtol=1e-9)
     assert not np.allclose(units, 4.0 * sizes, rtol=0.1)
+    shares = learner._episodes._relative
+    learner._decide_at_every_step()  # a resumed training comes here with its first units
+    np.testing.assert_array_equal(learner._episodes._relative, shares)
 
 
 def test_light_joints_have_small_units(small_file, small_scene):
