@@ -62,6 +62,8 @@ def _observations(environment: DQSpaceArmVectorEnv, times: Array, inputs: Array)
     stages = None  # a target that moves stands at its start: its motion would count as spread
     if kernels.parameters.staged:
         stages = Starts.of(kernels, states, environment.parameters, times).at(np.arange(SEEN))
+        moving = list(kernels.parameters.moving)
+        stages[:, :, moving] = environment.parameters[:, moving]
     for k, step in enumerate(np.diff(times)):
         left = np.full((SEEN, 1), times[-1] - times[k])
         p = given if stages is None else stages[k]
