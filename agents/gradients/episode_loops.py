@@ -70,7 +70,7 @@ class Flown(NamedTuple):
     low: Array  # limits of the inputs likewise
     high: Array
     held: Array  # weight of a decision's input in the cost, (K,)
-    efforts: Array  # costs of inputs, (n_u,)
+    efforts: Array  # weights of inputs in the cost, (K, n_u)
     spent: Array  # cost of the inputs of each episode, (B,)
 
 
@@ -274,7 +274,7 @@ def _act(k: int, outputs: Array, arrivals: Arrivals, flown: Flown) -> None:
             elif wanted > flown.high[k, row, a]:
                 wanted = flown.high[k, row, a]
             flown.inputs[k, i, a] = wanted
-            spent += flown.efforts[a] * wanted * wanted
+            spent += flown.efforts[k, a] * wanted * wanted
         flown.spent[i] += flown.held[k] * spent
 
 
@@ -286,7 +286,7 @@ def _act_back(k: int, arrivals: Arrivals, flown: Flown, slopes: Slopes, kept: in
         newest, before = arrivals.newest[k, i], arrivals.before[k, i]
         ahead, row = arrivals.ahead[k, i], i if of_each else 0
         for a in range(slopes.by_inputs.shape[1]):
-            effort = 2.0 * flown.held[k] * flown.efforts[a] * flown.inputs[k, i, a]
+            effort = 2.0 * flown.held[k] * flown.efforts[k, a] * flown.inputs[k, i, a]
             slope, wanted = slopes.by_inputs[i, a] + effort, flown.wanted[k, i, a]
             # Beyond a limit only what leads back counts.
             above = wanted > flown.high[k, row, a] and slope < 0.0

@@ -125,9 +125,8 @@ class Episodes:
             observations=zeros(decisions, n_obs),
             wanted=zeros(decisions, kernels.n_u),
             inputs=zeros(decisions + 1, kernels.n_u),
-            **dict.fromkeys(("mean", "scale", "units", "low", "high"), np.empty(0)),
+            **dict.fromkeys(("mean", "scale", "units", "low", "high", "efforts"), np.empty(0)),
             held=steps / dt - self._weights[:-1],  # the input's cost is not of a point in time
-            efforts=np.array(layout.control_weight),
             spent=np.zeros(count),
         )
         self._inputs = self._flown.inputs
@@ -266,15 +265,21 @@ class Episodes:
         self.penalties.prepare(self.parameters, emphasis)
         self._layers.prepare()
         rows, decisions, layout = len(starts), len(self.substeps), self._kernels.layout
-        # Phases change limits.
+        # Phases change limits and weights.
         high = layout.limits_with(self.parameters if self._kernels.parameters.staged else self.parameters[:1])
         every = len(self.parameters), *high.shape[1:]
         units, low, high = (  # copies, as loops are compiled for arrays that may be written to
             np.array(np.broadcast_to(each, every), np.float64, order="C")
             for each in (self.units * high, layout.lower_limits(high), high)
         )
+        efforts = np.tile(layout.control_weight, (decisions, 1))
+        for index, name in enumerate(layout.control.weights):
+            if name in (names := layout.parameters.names):
+                efforts[:, index] = self.parameters[:decisions, 0, names.index(name)]
         mean, scale = np.array(mean, np.float64), np.array(scale, np.float64)
-        self._flown = self._flown._replace(mean=mean, scale=scale, units=units, low=low, high=high)
+        self._flown = self._flown._replace(
+            mean=mean, scale=scale, units=units, low=low, high=high, efforts=efforts
+        )
         self._flown.spent[:] = 0.0
         given = self._calls, self._layers.network, self._arrivals, self._flown
         if self._met.jumps is None and self._measured is self._states:

@@ -81,12 +81,16 @@ MISMATCH = FlightMismatch(mass_factors=(1.0,), noise=0.0, push=0.05, pushes=3, d
 
 
 def with_phases(scene, coast=1):
-    """A scene whose base becomes lighter after steps in which the robot coasts, and the pose counts."""
+    """A scene whose base becomes lighter, and its thrust dearer, after coasting, when the pose counts."""
     coasting = {"actuators": {"base_force": None, "base_torque": None, "joint_torque": None}}
     phases = [
         {"name": "full", "steps": scene.simulation.steps // 2},
         {"name": "coast", "steps": coast, "changes": {**coasting, "cost.pose": 1e4}},
-        {"name": "light", "steps": -(-scene.simulation.steps // 2) - coast, "changes": {"base.mass": 60}},
+        {
+            "name": "light",
+            "steps": -(-scene.simulation.steps // 2) - coast,
+            "changes": {"base.mass": 60, "cost.base_force": 3.0 * scene.cost.base_force[0]},
+        },
     ]
     return scene.replace(name="phased", phases=phases)
 
