@@ -83,13 +83,17 @@ MISMATCH = FlightMismatch(mass_factors=(1.0,), noise=0.0, push=0.05, pushes=3, d
 def with_phases(scene, coast=1):
     """A scene whose base becomes lighter, and its thrust dearer, after coasting, when the pose counts."""
     coasting = {"actuators": {"base_force": None, "base_torque": None, "joint_torque": None}}
+    dear = {"base_force": scene.cost.base_force, "base_torque": scene.cost.base_torque}
     phases = [
         {"name": "full", "steps": scene.simulation.steps // 2},
         {"name": "coast", "steps": coast, "changes": {**coasting, "cost.pose": 1e4}},
         {
             "name": "light",
             "steps": -(-scene.simulation.steps // 2) - coast,
-            "changes": {"base.mass": 60, "cost.base_force": 3.0 * scene.cost.base_force[0]},
+            "changes": {
+                "base.mass": 60,
+                **{f"cost.{name}": 10.0 * max(weights) for name, weights in dear.items()},
+            },
         },
     ]
     return scene.replace(name="phased", phases=phases)
@@ -349,10 +353,13 @@ def test_noise_is_refused_by_episodes_made_without(small_scene):
         Flown(small_scene).meet(MISMATCH.model_copy(update={"noise": 0.02}))
 
 
-@pytest.mark.parametrize("phased", [False, True])
-def test_decisions_fly_as_at_every_time_step(phased):
+@pytest.mark.parametrize("case", ["plain", "phases", "dear phases"])
+def test_decisions_fly_as_at_every_time_step(case):
     """Costs differ by the square of the time between decisions."""
-    scene = with_phases(load_scene("planar")) if phased else load_scene("planar")
+    scene = load_scene("planar")
+    if "dear" in case:
+        scene = scene.replace(cost={"base_force": 1e4, "base_torque": 1e4})
+    scene = with_phases(scene) if "phases" in case else scene
     flights = rollout(Flown(scene).policy(), scene, SEEDS)
     errors = [np.abs(Flown(scene, n).costs() / flights.cost - 1.0).mean() for n in (20, 40, 80)]
     assert errors[0] < 5e-3
