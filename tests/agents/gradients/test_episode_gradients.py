@@ -83,17 +83,14 @@ MISMATCH = FlightMismatch(mass_factors=(1.0,), noise=0.0, push=0.05, pushes=3, d
 def with_phases(scene, coast=1):
     """A scene whose base becomes lighter, and its thrust dearer, after coasting, when the pose counts."""
     coasting = {"actuators": {"base_force": None, "base_torque": None, "joint_torque": None}}
-    dear = {"base_force": scene.cost.base_force, "base_torque": scene.cost.base_torque}
+    dearer = {f"cost.{name}": 10.0 * getattr(scene.cost, name)[0] for name in ("base_force", "base_torque")}
     phases = [
         {"name": "full", "steps": scene.simulation.steps // 2},
         {"name": "coast", "steps": coast, "changes": {**coasting, "cost.pose": 1e4}},
         {
             "name": "light",
             "steps": -(-scene.simulation.steps // 2) - coast,
-            "changes": {
-                "base.mass": 60,
-                **{f"cost.{name}": 10.0 * max(weights) for name, weights in dear.items()},
-            },
+            "changes": {"base.mass": 60, **dearer},
         },
     ]
     return scene.replace(name="phased", phases=phases)
