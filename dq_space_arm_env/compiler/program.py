@@ -123,21 +123,27 @@ class Program:
         """Repeat the calls appended inside, at least once, while `condition` is set; see `Loop`."""
         begin = len(self.calls)
         yield
-        if any(loop.begin >= begin for loop in self.loops):
-            raise ValueError(f"program {self.name!r}: a loop inside a loop")
+        for stretches, what in ((self.loops, "loop"), (self.guards, "guard")):
+            if any(stretch.begin >= begin for stretch in stretches):
+                raise ValueError(f"program {self.name!r}: a {what} inside a loop")
         self.loops.append(Loop(begin, len(self.calls), condition))
 
     @contextmanager
     def only_where(self, condition: str) -> Iterator[None]:
         """Run the calls appended inside only if `condition` is set in some lane of a block; see `Guard`.
 
-        What they alone write is arbitrary where they do not run.
+        What they alone write is arbitrary where they do not run. Earlier calls have to write the condition.
         """
         begin = len(self.calls)
+        if condition not in self._written():
+            raise ValueError(f"program {self.name!r}: no call has written {condition!r}, a guard's condition")
         yield
         if any(guard.end > begin for guard in self.guards):
             raise ValueError(f"program {self.name!r}: a guard inside a guard")
         self.guards.append(Guard(begin, len(self.calls), condition))
+
+    def _written(self) -> set[str]:
+        return {call.bindings.get(name, name) for call in self.calls for name, _ in call.graph.outputs}
 
     @property
     def is_straight(self) -> bool:

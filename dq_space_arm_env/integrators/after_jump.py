@@ -118,3 +118,5 @@ def rename(program: Program, begin: int, names: dict[str, str]) -> None:
         changed = {name: names[buffer] for name, buffer in found.items() if buffer in names}
         if changed:
             program.calls[number] = Call(graph, {**bindings, **changed})
+    conditions = [loop.condition for loop in program.loops] + [guard.condition for guard in program.guards]
+    assert not names.keys() & set(conditions)  # which keep their names

@@ -113,8 +113,9 @@ def step(
 ) -> Outputs:
     """Observation, reward, and end of the episode after a step from x to x_next, with its error.
 
-    `unsound` is whether the simulation `diverged`; `worst`, `most_cost`, is read only where the episode ends
-    early. Where the target passes waypoints, `following` is the next row of `given_path`.
+    `unsound` is whether the simulation `diverged`, judged after a catch where there is one; `worst`,
+    `most_cost`, is read only where the episode ends early. Where the target passes waypoints, `following` is
+    the next row of `given_path`.
     """
     scene = equations.scene
     steps, dt = scene.simulation.steps, scene.simulation.dt
@@ -125,7 +126,7 @@ def step(
     rest, caught = target, []
     if has_catch(scene):
         x_next, *caught = _catch(with_target(before, target), x_next, taken + 1.0, memory[-1])
-        rest = [*target, caught[0]]
+        rest, unsound = [*target, caught[0]], diverged(x_next)["unsound"]
     rest = _resting(scene, taken + 1.0, rest)
     after = at_stage(equations, taken + 1.0, rest)
 

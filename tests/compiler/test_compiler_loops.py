@@ -92,6 +92,12 @@ def test_guards_are_not_nested_and_have_no_derivatives():
     with pytest.raises(ValueError, match="'guarded': a guard inside a guard"):  # noqa: SIM117
         with program.only_where("is_negative"):
             program.append(guarded(), ran="ran_too")
+    with pytest.raises(ValueError, match="'guarded': a guard inside a loop"):  # noqa: SIM117
+        with program.repeated_while("is_negative"):
+            program.append(guarded(), ran="ran_thrice")
+    with pytest.raises(ValueError, match="no call has written 'x', a guard's condition"):  # noqa: SIM117
+        with program.only_where("x"):
+            pass
     with pytest.raises(ValueError, match="'guarded' has a loop or a guard, which has no reverse"):
         append_cotangents(guarded(), {"ran": "x"}, ("x",))
     with pytest.raises(ValueError, match="'guarded' has a guard, which has no tangents"):

@@ -274,6 +274,29 @@ def test_a_catch_outside_the_tolerances_fails() -> None:
     )
 
 
+def test_a_catch_beyond_all_limits_is_a_divergence() -> None:
+    light = {"mass": 0.1, "inertia": [1e-4, 1e-4, 1e-4], "center_of_mass": [0.01, 0.0, 0.0]}
+    short = {
+        f"links.{i}.joint.position": place for i, place in ((1, [0.0, 0.0, 0.02]), (2, [0.02, 0.0, 0.0]))
+    }
+    changes = {f"links.{i}": light for i in range(3)} | short | {"tip.position": [0.02, 0.0, 0.0]}
+    changes |= {f"phases.{i}.steps": steps for i, steps in enumerate((1, 1, 3))}
+    changes |= {"phases.2.catch": {**ANYWAY, "position_error": 1e6}, "simulation.steps": 5}
+    changes |= {"target.motion.linear_velocity": [3e5, 3e5, 2e5], "payload.center_of_mass": [0.035, 0.0, 0.0]}
+    scene = load_scene("capture-and-detumble").replace(changes)
+    env: Any = gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape)
+    assert not env.step(action)[2]
+    before = env.state
+    observation, reward, terminated, _, info = env.step(action)
+    assert terminated
+    assert info["diverged"]
+    assert reward < -1e20  # all that is left, with as much energy as a catch can bring
+    np.testing.assert_array_equal(env.state, before)
+    assert env.observation_space.contains(observation)
+
+
 def test_the_shock_is_the_change_of_the_payloads_momentum() -> None:
     scene = SCENES["capture-and-detumble"]
     env = gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped

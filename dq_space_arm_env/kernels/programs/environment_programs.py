@@ -24,6 +24,7 @@ from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import number_of_draws
 from dq_space_arm_env.task import episode
 from dq_space_arm_env.task.actuator_limits import reads_state
+from dq_space_arm_env.task.catching import has_catch
 from dq_space_arm_env.task.equations import SceneEquations
 from dq_space_arm_env.task.step_report import MEMORY, memory_names
 
@@ -115,12 +116,12 @@ class EnvironmentPrograms:
         return program
 
     def _append_most_cost(self, program: Program, n_memory: int) -> None:
-        """What is charged where an episode ends early; if only divergence ends it, computed only then."""
+        """What is charged where an episode ends early; computed only then, if the step alone tells."""
         n_x = self.equations.field.n_x
         most = partial(episode.most_cost, self.equations)
         graph = trace("worst_graph", {"x": n_x, "memory": n_memory}, most, parameters=self._parameters)
-        violations_end = any(each.terminates for each in self.scene.constraints)
-        with nullcontext() if violations_end else program.only_where("unsound"):
+        known = not has_catch(self.scene) and not any(each.terminates for each in self.scene.constraints)
+        with program.only_where("unsound") if known else nullcontext():
             program.call(graph, **self._episode)
 
     @property
