@@ -266,16 +266,15 @@ class Episodes:
         self._layers.prepare()
         rows, decisions, layout = len(starts), len(self.substeps), self._kernels.layout
         # Phases change limits and weights.
-        high = layout.limits_with(self.parameters if self._kernels.parameters.staged else self.parameters[:1])
+        given_now = self.parameters if self._kernels.parameters.staged else self.parameters[:1]
+        high = layout.limits_with(given_now)
+        weights = layout.weights_with(given_now[:decisions, 0])  # of all episodes alike
+        efforts = np.array(np.broadcast_to(weights, (decisions, self._kernels.n_u)), np.float64)
         every = len(self.parameters), *high.shape[1:]
         units, low, high = (  # copies, as loops are compiled for arrays that may be written to
             np.array(np.broadcast_to(each, every), np.float64, order="C")
             for each in (self.units * high, layout.lower_limits(high), high)
         )
-        efforts = np.tile(layout.control_weight, (decisions, 1))
-        for index, name in enumerate(layout.control.weights):
-            if name in (names := layout.parameters.names):
-                efforts[:, index] = self.parameters[:decisions, 0, names.index(name)]
         mean, scale = np.array(mean, np.float64), np.array(scale, np.float64)
         self._flown = self._flown._replace(
             mean=mean, scale=scale, units=units, low=low, high=high, efforts=efforts

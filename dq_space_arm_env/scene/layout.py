@@ -11,6 +11,7 @@ A planar base keeps only what is not zero by construction: q_r0, q_r3, q_d1, q_d
 v_x, v_y.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -205,11 +206,19 @@ class StateLayout:
         Returns:
             Largest magnitudes, shape (..., n_u), N, N m, rad/s.
         """
-        limits = np.broadcast_to(self.control_limit, (*parameters.shape[:-1], self.n_u)).copy()
-        for index, name in enumerate(self.control.limits):
+        return self._given(self.control.limits, self.control_limit, parameters)
+
+    def weights_with(self, parameters: Array) -> Array:
+        """Weights of the squared controls in the cost, likewise, shape (..., n_u)."""
+        return self._given(self.control.weights, self.control_weight, parameters)
+
+    def _given(self, names: Sequence[str], nominal: Array, parameters: Array) -> Array:
+        """Numbers of the controls, (..., n_u), of which those with the name of a parameter have its value."""
+        values = np.broadcast_to(nominal, (*parameters.shape[:-1], self.n_u)).copy()
+        for index, name in enumerate(names):
             if name in self.parameters.names:
-                limits[..., index] = parameters[..., self.parameters.names.index(name)]
-        return limits
+                values[..., index] = parameters[..., self.parameters.names.index(name)]
+        return values
 
     def lower_limits(self, limits: Array) -> Array:
         """Least controls, where the greatest are given: zero for thrusters, the limits' negatives for others.

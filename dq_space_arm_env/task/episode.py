@@ -106,16 +106,16 @@ def step(
     x_next: Scalars,
     u: Scalars,
     memory: Scalars,
-    unsound: Scalars,
     worst: Scalars,
+    unsound: Scalars = (),
     checked_error: Scalars = (math.nan,),
     following: Scalars = (),
 ) -> Outputs:
     """Observation, reward, and end of the episode after a step from x to x_next, with its error.
 
-    `unsound` is whether the simulation `diverged`, judged after a catch where there is one; `worst`,
-    `most_cost`, is read only where the episode ends early. Where the target passes waypoints, `following` is
-    the next row of `given_path`.
+    `worst`, `most_cost`, is read only where the episode ends early; `unsound`, whether the simulation
+    `diverged`, may be given where nothing is caught. Where the target passes waypoints, `following` is the
+    next row of `given_path`.
     """
     scene = equations.scene
     steps, dt = scene.simulation.steps, scene.simulation.dt
@@ -126,13 +126,13 @@ def step(
     rest, caught = target, []
     if has_catch(scene):
         x_next, *caught = _catch(with_target(before, target), x_next, taken + 1.0, memory[-1])
-        rest, unsound = [*target, caught[0]], diverged(x_next)["unsound"]
+        rest = [*target, caught[0]]
     rest = _resting(scene, taken + 1.0, rest)
     after = at_stage(equations, taken + 1.0, rest)
 
     # The episode ends at the scene's number of steps, or when the simulation diverges, which leaves it at the
     # last sound state.
-    sound = casadi.logic_not(unsound[0])
+    sound = casadi.logic_not((unsound or diverged(x_next)["unsound"])[0])
     x_kept = [casadi.if_else(sound, new, old) for new, old in zip(x_next, x, strict=True)]
     at_end = casadi.logic_or(taken == steps - 1, casadi.logic_not(sound))
     terminated, finished, charges = at_end, sound, []

@@ -7,7 +7,6 @@ input, `parameters`; a scene in which nothing does has no such input.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -106,23 +105,26 @@ class EnvironmentPrograms:
         method = checked_integrator_of(simulation, integrator)
         stepper = actuated(method or integrator_of(simulation, integrator), equations.field)
         stepper.append_step(program, equations.field)
-        program.call(trace("diverged_graph", {"x_next": n_x}, episode.diverged))
-        self._append_most_cost(program, n_memory)
-        sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory, "unsound": 1, "worst": 1}
-        sizes |= ({"checked_error": 1} if method else {}) | following
+        sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory}
+        sizes |= self._append_most_cost(program, n_memory) | ({"checked_error": 1} if method else {})
+        sizes |= following
         report = trace("report_graph", sizes, partial(episode.step, equations), parameters=self._parameters)
         program.call(report, **self._episode)
         program.outputs = _outputs(report)
         return program
 
-    def _append_most_cost(self, program: Program, n_memory: int) -> None:
-        """What is charged where an episode ends early; computed only then, if the step alone tells."""
+    def _append_most_cost(self, program: Program, n_memory: int) -> dict[str, int]:
+        """What is charged where an episode ends early; sizes of the buffers that tell."""
         n_x = self.equations.field.n_x
         most = partial(episode.most_cost, self.equations)
         graph = trace("worst_graph", {"x": n_x, "memory": n_memory}, most, parameters=self._parameters)
-        known = not has_catch(self.scene) and not any(each.terminates for each in self.scene.constraints)
-        with program.only_where("unsound") if known else nullcontext():
+        if has_catch(self.scene) or any(each.terminates for each in self.scene.constraints):
             program.call(graph, **self._episode)
+            return {"worst": 1}
+        program.call(trace("diverged_graph", {"x_next": n_x}, episode.diverged))
+        with program.only_where("unsound"):
+            program.call(graph, **self._episode)
+        return {"worst": 1, "unsound": 1}
 
     @property
     def _episode(self) -> dict[str, str]:
