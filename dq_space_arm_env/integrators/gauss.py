@@ -116,7 +116,7 @@ class Gauss:
         program.call(graphs.enter())
         rates, passed, taken = graphs.rates(), graphs.passed(), graphs.taken()
         numbers = range(self.tableau.stages)
-        tried = {f"kept{i}": f"passed{i}" for i in numbers}
+        tried = {"kept_total": "passed_total", **{f"kept{i}": f"passed{i}" for i in numbers}}
         # In the first pass, the rates at the start are those of all stages.
         program.call(rates, stage="stage0", rate="rate0")
         one = {f"{name}{i}": f"{name}0" for name in ("rate", "stage") for i in numbers}
@@ -161,11 +161,12 @@ class _Graphs:
             [symbols(f"{name}{i}", self.n) for i in range(tableau.stages)]
             for name in ("rate", "stage", "passed")
         )
+        # sum_j w_j of the last pass that was kept, which makes the state after the step, and of the new one
+        self.total, self.new_total = symbols("total", self.n), symbols("passed_total", self.n)
         self.weighted = [  # w_j
             [self.h * (weight * entry) for entry in rate]
             for weight, rate in zip(tableau.weights, self.rate, strict=True)
         ]
-        self.total = [sum(entries) for entries in zip(*self.weighted, strict=True)]
         self.joints = len(self.given.joint_indices)
         self.remainder, self.moved = symbols("remainder", self.joints), symbols("moved", self.joints)
         handed = self.given.turned_back(self.x, self.momentum) if walks else None
@@ -220,10 +221,11 @@ class _Graphs:
         return self._graph("rates", inputs, {"rate": self.equations.rates(at, self.u)})
 
     def passed(self) -> Any:
-        """Graph of the stages after a pass."""
+        """Graph of the stages after a pass, and of the sum of w_j that made them."""
         count, new = self.tableau.stages, []
+        total = [sum(entries) for entries in zip(*self.weighted, strict=True)]
         for i in range(count):
-            entries = [0.5 * entry for entry in self.total]
+            entries = [0.5 * entry for entry in total]
             for j in range(count):
                 if coupling := self.tableau.coupling(i, j):
                     entries = [a + coupling * b for a, b in zip(entries, self.weighted[j], strict=True)]
@@ -232,7 +234,8 @@ class _Graphs:
         if self.system is not None:
             inputs |= _numbered("stage", self.stage)
             new = self._solved(new, inputs)
-        return graph_of(f"{self.prefix}_passed", inputs, _numbered("passed", new))
+        outputs = {**_numbered("passed", new), "passed_total": total}
+        return graph_of(f"{self.prefix}_passed", inputs, outputs)
 
     # Springs and dampers: for residuals r of all stages,
     #     dq = r_q + (h A x W) dp,   dp = r_p - (h A x K) dq - (h A x D W) dp,
@@ -280,7 +283,7 @@ class _Graphs:
         ]
 
     def judged(self) -> Any:
-        """Graph of what a pass changed, whether another one follows, and the stages to keep.
+        """Graph of what a pass changed, whether another one follows, and the stages and sum of w_j to keep.
 
         The judgement: 1 until passes have converged, the sum of the last changes of angles, the passes taken.
         """
@@ -303,20 +306,24 @@ class _Graphs:
             casadi.if_else(going, change, last_change),
             casadi.if_else(going, taken, passes),
         ]
-        kept = [
-            [casadi.if_else(going, b, a) for a, b in zip(old, new, strict=True)]
-            for old, new in zip(self.stage, self.new, strict=True)
-        ]
+
+        def kept(old: Scalars, new: Scalars) -> list[Scalar]:
+            return [casadi.if_else(going, b, a) for a, b in zip(old, new, strict=True)]
+
         inputs: dict[str, Scalars] = {"start": self.start, "judgement": [pending, last_change, passes]}
         inputs |= {**_numbered("stage", self.stage), **_numbered("passed", self.new)}
+        inputs |= {"total": self.total, "passed_total": self.new_total}
         unfinished = casadi.logic_and(judged[0], judged[2] < MOST_PASSES)
-        outputs = {**_numbered("kept", kept), "judged": judged, "unfinished": [unfinished]}
+        outputs = _numbered("kept", list(map(kept, self.stage, self.new)))
+        outputs |= {"kept_total": kept(self.total, self.new_total)}
+        outputs |= {"judged": judged, "unfinished": [unfinished]}
         return graph_of(f"{self.prefix}_judged", inputs, outputs)
 
     def taken(self) -> Any:
-        """Graph that copies stages: a graph may not write where it reads."""
-        inputs = _numbered("kept", self.stage)
-        return graph_of(f"{self.prefix}_taken", inputs, _numbered("stage", self.stage))
+        """Graph that copies stages and sum of w_j: a graph may not write where it reads."""
+        inputs = {**_numbered("kept", self.stage), "kept_total": self.total}
+        outputs = {**_numbered("stage", self.stage), "total": self.total}
+        return graph_of(f"{self.prefix}_taken", inputs, outputs)
 
     def noted(self) -> Any:
         """Graph that copies the judgement."""
@@ -341,7 +348,7 @@ class _Graphs:
             outputs["momentum_next"] = or_nan(handed, judgement[0])
             outputs |= {"moved": moved} if self.joints else {}
         inputs = self._whole() | {"start": self.start, "center": center, "judgement": judgement}
-        inputs |= {"h": [self.h], **_numbered("rate", self.rate)}
+        inputs |= {"total": self.total}
         return self._graph("carry_out" if self.walks else "leave", inputs, outputs)
 
     def cut_off(self) -> Any:

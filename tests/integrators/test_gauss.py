@@ -203,3 +203,19 @@ def test_a_free_body_turns_by_the_exact_momentum():
 
 def test_the_registry_says_which_methods_are_symplectic():
     assert [name for name, entry in INTEGRATORS.items() if entry.symplectic] == [NAME]
+
+
+@pytest.mark.parametrize("scene", ["paper", "planar"])
+def test_lanes_that_wait_for_others_give_the_bits_of_single_states(scene):
+    """Fast and slow joints take different numbers of passes, or do not converge."""
+    kernels = compile_scene(simulated(scene, integrator=NAME, dt=0.05))
+    rng = np.random.default_rng(2)
+    x = np.array([moving_start(kernels, seed, joint_rate=0.1, base_rate=0.1) for seed in range(64)])
+    x[:, kernels.layout.state.joint_rates] *= rng.choice([0.0, 1.0, 30.0, 300.0, 3e4], (64, 1))
+    u = rng.uniform(-1.0, 1.0, (64, kernels.n_u)) * kernels.layout.control_limit
+    stepped, linearized = kernels.step(x, u), kernels.linearize(x, u)
+    assert np.isnan(stepped).any()
+    for row in range(64):
+        np.testing.assert_array_equal(kernels.step(x[row], u[row]), stepped[row])
+        for alone, together in zip(kernels.linearize(x[row], u[row]), linearized, strict=True):
+            np.testing.assert_array_equal(alone, together[row])
