@@ -76,7 +76,8 @@ def _observations(environment: DQSpaceArmVectorEnv, times: Array, inputs: Array)
 def motions(scene: Scene, share: float) -> Array:
     """How far each input, at a share of its limit, moves something, (n_u,).
 
-    Largest motion of base, joints and wrist over an episode, rad and m; by much smaller inputs, linearly.
+    Largest motion of joints, wrist, and base over an episode, rad and m; by much smaller inputs, linearly.
+    The base's is that of its dual quaternion's entries: half of its angles and positions.
     """
     kernels = compile_scene(scene)
     small = SMALLER * share * np.diag(kernels.layout.control_limit)

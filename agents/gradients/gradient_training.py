@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from agents.configuration.gradients import GradientConfiguration
 from agents.gradients.disturbed_flights import Met, calm
 from agents.gradients.episodes import Episodes, decision_times
+from agents.gradients.fallback import LEAST_RATE, Fallback
 from agents.gradients.first_units import first_units
 from agents.gradients.layers import Layers, random_weights
 from agents.gradients.soap import SOAP
@@ -52,24 +53,11 @@ TRAVELLED = 0.3  # share of the updates after which missing the tolerances has a
 MISSING = 0.25  # share of episodes that miss them, up to which the end weight falls
 LIGHTER = 1.01  # factor of its fall in an update
 COARSE = 1e-4  # tolerance of methods that adapt their steps, rad and m; at least the scene's
-WORSE = 2.0  # median cost relative to recent ones, above which the weights go back to what they were
-DRIFTED = 1.5  # likewise of recent costs, relative to those with the weights to go back to
-WORTHY = 1.2  # likewise, up to which newer weights take their place
-LOST = 0.3  # further share of episodes that miss the tolerances, beyond which the weights go back, too
-WORTHY_LOSS = 0.1  # likewise, up to which newer weights take their place
-PATIENCE = 1.003  # factor in an update by which costs may rise, as where constraints come to matter
-FORGETTING = 0.05  # share of the newest in the mean of recent costs
-BETWEEN_COPIES = 50  # updates between copies of the weights; those to go back to are the last but one
-MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives up
-CAUTION = 0.7  # factor of the learning rate when they do
-RECOVERY = 1.001  # factor by which it comes back in an update
 EVERY_STEP = 0.9  # share of the updates after which constrained episodes decide at every time step
 BETWEEN_DIVISIONS = 20  # updates between measurements of the integration's errors
 TOLERATED = 1e-3  # share of the cost by which the integration may change it, divided by the decisions
 BETWEEN_MESSAGES = 20  # updates
 CHECKPOINT = "checkpoint.npz"
-_NUMBERS = ("_seconds", "_typical", "_missing", "_caution", "_growth")
-_COPIES = ("_kept", "_newer")
 
 
 class Learned(NamedTuple):
@@ -124,11 +112,8 @@ class _Learner:
         self._every_step_from = math.ceil(EVERY_STEP * settings.updates) if becomes_finer else math.inf
         self._optimizer = SOAP(self._weights)
         self._updates, self._seconds = 0, 0.0
-        self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
-        self._growth = FASTEST_UNITS  # of units, at most
         self._end_weight = settings.end_weight
-        self._missing = 1.0  # share of recent episodes that miss the tolerances
-        self._kept, self._newer = self._state(), self._state()
+        self._fallback = Fallback(self._state())
 
     def _begin_episodes(self, units: Array) -> Episodes:
         """Episodes that decide at the present times."""
@@ -148,13 +133,7 @@ class _Learner:
         self._times = simulation.dt * np.arange(simulation.steps + 1)
         self._episodes = self._begin_episodes(before.units)
         self._episodes.follow_on(before)
-        self._forget_costs()
-
-    def _forget_costs(self) -> None:
-        """Begin with recent costs anew: the same motions have others now."""
-        self._typical = math.inf
-        for copy in (self._kept, self._newer):
-            copy["typical"][...] = math.inf
+        self._fallback.forget_costs()
 
     def _begin_with(self, policy: ExportedPolicy | None, units: Array) -> None:
         """Take the weights of a policy, and its units; outputs have some of their own."""
@@ -195,7 +174,8 @@ class _Learner:
 
     def _update(self) -> float:
         """Fly episodes, take a step, and return their median cost."""
-        settings, done = self._settings, self._updates
+        settings, fallback, done = self._settings, self._fallback, self._updates
+        warm = done > WARM_UP
         if done == self._every_step_from:
             self._decide_at_every_step()
         # Seeded by the update, so that checkpoints need no generator's state.
@@ -211,39 +191,24 @@ class _Learner:
         if self._mismatch is not None:
             self._episodes.meet(Met.draw(self._mismatch, self._flown, self._times, len(rows), rng))
         gradient, median = self._fly(starts)
-        is_unstable = self._is_unstable(median)  # motions that are lost err without being worth substeps
+        is_unstable = fallback.is_needed(median, warm)  # lost motions err without being worth substeps
         if done % BETWEEN_DIVISIONS == 0 and not is_unstable and self._divide(median):
             gradient, median = self._fly(starts)
-            is_unstable = self._is_unstable(median)
+            is_unstable = fallback.is_needed(median, warm)
         if is_unstable:
-            # The motion has become unstable: take the weights from before, and smaller steps.
-            self._restore(self._kept)
+            self._restore(fallback.kept.arrays)
             before = self._fly(starts)[1]
-            self._typical = min(self._typical, float(self._kept["typical"]))
-            self._missing = min(self._missing, float(self._kept["missing"]))
-            if not self._divide(before) and before > WORSE * self._typical:
-                self._typical = before  # those were no better
-                self._kept["typical"][...] = before
-            self._newer = {name: each.copy() for name, each in self._kept.items()}
-            self._caution *= CAUTION
-            self._growth = 1.0
+            fallback.go_back(before, other_costs=self._divide(before))
         else:
             self._follow(gradient, median)
-        if self._caution < MOST_CAUTION:
+        if fallback.rate < LEAST_RATE:
             raise DivergedError(
                 f"training diverged: at update {done + 1} flights cost {median:.4g} where they did "
-                f"{self._typical:.4g}, again and again; reduce algorithm.learning_rate = "
+                f"{fallback.cost:.4g}, again and again; reduce algorithm.learning_rate = "
                 f"{settings.learning_rate:g}"
             )
         self._updates += 1
         return median
-
-    def _is_unstable(self, median: float) -> bool:
-        """Whether episodes with a median cost, or the recent ones, have lost what earlier ones had."""
-        drifted = self._typical > DRIFTED * self._kept["typical"]
-        drifted |= self._missing > self._kept["missing"] + LOST
-        lost = self._updates > WARM_UP and bool(drifted or median > WORSE * self._typical)
-        return math.isinf(median) or lost
 
     def _fly(self, starts: Array) -> tuple[list[Array], float]:
         """The gradient of episodes, and their median cost; infinite where all diverge."""
@@ -263,28 +228,22 @@ class _Learner:
         if not wrong.any():
             return False
         episodes.divide(np.where(wrong, np.minimum(2 * episodes.substeps, most), episodes.substeps))
-        self._forget_costs()
+        self._fallback.forget_costs()
         return True
 
     def _follow(self, gradient: Sequence[Array], median: float) -> None:
         """Take a step against the gradient of episodes with a median cost."""
-        done, settings = self._updates, self._settings
-        stays = self._typical <= WORTHY * self._kept["typical"]
-        stays &= self._missing <= self._kept["missing"] + WORTHY_LOSS
-        if done % BETWEEN_COPIES == 0 and stays:
-            # The newest may be on the brink: it is gone back to once what came of it is known.
-            self._kept, self._newer = self._newer, self._state()
-        for copy in (self._kept, self._newer):
-            copy["typical"] *= PATIENCE
+        done, settings, fallback = self._updates, self._settings, self._fallback
+        if fallback.takes_copy(done):
+            fallback.copy(self._state())
+        fallback.recover()
         warm_up = min(1.0, (done + 1) / WARM_UP)
         falling = FINAL_RATE + (1.0 - FINAL_RATE) * 0.5 * (1.0 + math.cos(math.pi * done / settings.updates))
         # Relative to the cost, which differs by orders between scenes, a gradient has the norm 1 at most.
         norm = math.sqrt(sum(float(np.square(each, dtype=np.float64).sum()) for each in gradient))
         relative = [each / np.float32(max(norm, median)) for each in gradient]
-        self._caution = min(self._caution * RECOVERY, 1.0)
-        self._optimizer.update(relative, self._caution * warm_up * falling * settings.learning_rate)
-        recent = self._typical if math.isfinite(self._typical) else median
-        self._typical = recent + FORGETTING * (median - recent)
+        self._optimizer.update(relative, fallback.rate * warm_up * falling * settings.learning_rate)
+        fallback.note_cost(median)
         self._adapt()
 
     def _adapt(self) -> None:
@@ -294,12 +253,13 @@ class _Learner:
         if 1.0 - reaches.mean() <= MISSING:
             self._end_weight = max(self._end_weight / LIGHTER, 1.0)
         judged = settings.copies if self._mismatch is None else calm(settings.copies)
-        self._missing += FORGETTING * (1.0 - reaches[:judged].mean() - self._missing)
+        self._fallback.note_misses(1.0 - reaches[:judged].mean())
         travelled = self._updates > TRAVELLED * settings.updates
-        episodes.price_violations(self._typical, judged if travelled else 0)
+        episodes.price_violations(self._fallback.cost, judged if travelled else 0)
         episodes.price_roughness()
         factors = UNITS_PER_SIZE * episodes.sizes() / episodes.units
-        factors = np.clip(factors, 1.0 / FASTEST_UNITS, self._growth)
+        growth = 1.0 if self._fallback.happened else FASTEST_UNITS
+        factors = np.clip(factors, 1.0 / FASTEST_UNITS, growth)
         episodes.units *= factors
         for weight in self._weights[-2:]:  # the policy stays what it is
             weight /= factors.astype(np.float32)
@@ -328,12 +288,11 @@ class _Learner:
         )
 
     def _state(self) -> dict[str, Array]:
-        """Copies of weights and optimizer by name, with the recent cost and share of misses."""
+        """Copies of weights and optimizer by name, and of what changes with them."""
         weights = {f"weight{index}": each for index, each in enumerate(self._weights)}
         everything = {**weights, **self._optimizer.arrays(), "units": self._episodes.units}
         everything["end_weight"] = np.array(self._end_weight)
         everything["prices"] = self._episodes.penalties.prices
-        everything |= {"typical": np.array(self._typical), "missing": np.array(self._missing)}
         return {name: np.array(each) for name, each in everything.items()}
 
     def _restore(self, arrays: Mapping[str, Array]) -> None:
@@ -345,10 +304,7 @@ class _Learner:
 
     def _everything(self) -> dict[str, Array]:
         """The arrays of a checkpoint by name."""
-        numbers = {name: getattr(self, name) for name in _NUMBERS}
-        arrays = {**self._state(), **{name: np.array(each) for name, each in numbers.items()}}
-        for copy in _COPIES:
-            arrays |= {f"{copy}.{name}": each for name, each in getattr(self, copy).items()}
+        arrays = {**self._state(), **self._fallback.arrays(), "seconds": np.array(self._seconds)}
         arrays |= {"mean": self._mean, "scale": self._scale, "substeps": self._episodes.substeps}
         arrays["cost"] = np.array(self._episodes.penalties.cost)
         arrays["roughness"] = np.array(self._episodes.roughness)
@@ -370,15 +326,11 @@ class _Learner:
             expected = sum(8 * each.size for each in self._everything().values())
             arrays = read_arrays(place / CHECKPOINT, most=expected + ARRAY_BYTES)
             self._restore(arrays)
-            for copy in _COPIES:
-                start = f"{copy}."
-                found = {name.removeprefix(start): a for name, a in arrays.items() if name.startswith(start)}
-                setattr(self, copy, found)
             self._updates = int(place.name)
             self._episodes.divide(arrays["substeps"])
             self._episodes.roughness = float(arrays["roughness"])
-            for name in _NUMBERS:
-                setattr(self, name, float(arrays[name]))
+            self._fallback.restore(arrays)  # after the division, which forgets costs
+            self._seconds = float(arrays["seconds"])
             self._mean, self._scale = arrays["mean"], arrays["scale"]
             self._episodes.penalties.cost = float(arrays["cost"])
         except (KeyError, ValueError, OSError, UnreadableError) as error:

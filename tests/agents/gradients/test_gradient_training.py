@@ -45,7 +45,7 @@ def test_decisions_are_divided_where_the_integration_errs(small_file, small_scen
     most = np.ceil(lengths / small_scene.simulation.dt - 1e-9)
     while learner._divide(learner._fly(starts)[1]):
         assert (learner._episodes.substeps <= most).all()
-        assert math.isinf(learner._typical)
+        assert math.isinf(learner._fallback.cost)
     substeps, errors = learner._episodes.substeps, learner._episodes.errors()
     assert substeps.min() < substeps.max()
     errs = errors > 1e-9 * learner._fly(starts)[1] / len(errors)
@@ -233,21 +233,22 @@ def test_unstable_motions_go_back_to_the_last_copy_but_one(small_file, small_sce
     learner = gradient_training._Learner(settings(small_file), small_scene)
     for _ in range(updates):
         learner._update()
-    kept, caution = learner._kept["weight0"].copy(), learner._caution
+    fallback = learner._fallback
+    kept, rate = fallback.kept.arrays["weight0"].copy(), fallback.rate
     learner._weights[0][:] += 0.1
     measured = []
     learner._divide = lambda _: measured.append(learner._weights[0].copy())  # or costs would be others
-    learner._typical = 1e-3  # even the copy is no better: training goes on from its cost
+    fallback.cost = 1e-3  # even the copy is no better: training goes on from its cost
     learner._update()
     np.testing.assert_array_equal(measured, [kept])  # not what has become unstable
-    for weights in (learner._weights[0], learner._newer["weight0"]):  # what came of the last one is lost
+    for weights in (learner._weights[0], fallback.newer.arrays["weight0"]):  # what came of the last is lost
         np.testing.assert_array_equal(weights, kept)
-    assert learner._caution < caution
-    assert 1e-3 < learner._typical == learner._kept["typical"]
-    caution = learner._caution
+    assert fallback.rate < rate
+    assert 1e-3 < fallback.cost == fallback.kept.cost
+    rate = fallback.rate
     learner._update()
     assert not np.array_equal(learner._weights[0], kept)
-    assert learner._caution == pytest.approx(1.001 * caution)
+    assert fallback.rate == pytest.approx(1.001 * rate)
 
 
 @pytest.mark.parametrize("what", ["costs", "misses"])
@@ -255,17 +256,18 @@ def test_what_drifts_goes_back_to_a_copy(small_file, small_scene, what):
     learner = gradient_training._Learner(settings(small_file), small_scene)
     for _ in range(61):  # the integration is not measured now
         learner._update()
-    kept, caution = learner._kept["weight0"].copy(), learner._caution
+    fallback = learner._fallback
+    kept, rate = fallback.kept.arrays["weight0"].copy(), fallback.rate
     assert not np.array_equal(learner._weights[0], kept)
     if what == "costs":
-        learner._kept["typical"][...] = learner._typical / 1.6
+        fallback.kept.cost = fallback.cost / 1.6
     else:
-        learner._kept["missing"][...] = learner._missing - 0.31
+        fallback.kept.missing = fallback.missing - 0.31
     learner._update()
     np.testing.assert_array_equal(learner._weights[0], kept)
-    assert learner._caution < caution
-    assert learner._typical <= learner._kept["typical"]
-    assert learner._missing <= learner._kept["missing"]
+    assert fallback.rate < rate
+    assert fallback.cost <= fallback.kept.cost
+    assert fallback.missing <= fallback.kept.missing
 
 
 @pytest.mark.parametrize(
@@ -275,12 +277,13 @@ def test_copies_are_taken_while_costs_and_misses_stay(small_file, small_scene, f
     learner = gradient_training._Learner(settings(small_file), small_scene)
     for _ in range(50):
         learner._update()
-    copies = learner._newer, learner._kept
-    before = [learner._weights[0].copy(), *(copy["weight0"].copy() for copy in copies)]
-    learner._kept["typical"][...] = learner._typical / factor
-    learner._kept["missing"][...] = learner._missing - more
+    fallback = learner._fallback
+    copies = fallback.newer, fallback.kept
+    before = [learner._weights[0].copy(), *(copy.arrays["weight0"].copy() for copy in copies)]
+    fallback.kept.cost = fallback.cost / factor
+    fallback.kept.missing = fallback.missing - more
     learner._update()
-    found = learner._newer["weight0"], learner._kept["weight0"]
+    found = fallback.newer.arrays["weight0"], fallback.kept.arrays["weight0"]
     np.testing.assert_array_equal(found, before[:2] if taken else before[1:])
 
 
