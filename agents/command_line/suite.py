@@ -88,8 +88,10 @@ def suite(
     the extra `agents`.
     """
     executor = chosen_executor(workers, ray)
-    from agents.suite.running import entrant_names, run_suite
-    from agents.suite.suite_page import check, check_columns, comparable, suite_page
+    from agents.suite.entrants import entrant_names
+    from agents.suite.running import run_suite
+    from agents.suite.suite_check import check, check_columns, comparable
+    from agents.suite.suite_page import suite_page
     from agents.suite.tasks import load_suite
     from dq_space_arm_env.common.progress import ProgressDisplay
     from dq_space_arm_env.common.tables import tabulate

@@ -18,8 +18,9 @@ from agents.evaluation.expert_costs import OptimalCosts
 from agents.policies.flying import Flights
 from agents.run_folder import DivergedError
 from agents.suite import Score, Suite, SuiteError, SuiteRun, list_suites, load_suite, run_suite
-from agents.suite.running import _from_files, _missing, entrant_names
-from agents.suite.suite_page import check, check_columns, comparable, overall_rows, suite_page
+from agents.suite.entrants import entrant_names, from_files, missing_files
+from agents.suite.suite_check import check, check_columns, comparable
+from agents.suite.suite_page import overall_rows, suite_page
 from agents.zoo.finding import PolicyError
 from agents.zoo.shelf import load_policy
 from dq_space_arm_env import load_scene
@@ -131,7 +132,7 @@ def test_what_is_no_suite_is_named():
 def test_missing_files_of_tasks_are_told(tmp_path):
     (tmp_path / "one.npz").touch()
     files = {"mine": f"{tmp_path}/{{task}}.npz", "other": "anywhere.npz"}
-    (note,) = _missing(files, ["scenes/one.yaml", "two", "three"])
+    (note,) = missing_files(files, ["scenes/one.yaml", "two", "three"])
     assert note == f"mine: there is no file {files['mine']} for two, three"
 
 
@@ -140,9 +141,9 @@ def test_a_missing_run_folder_beside_is_told_as_any_file_is(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine-one").mkdir()
     (tmp_path / "mine-one" / "policy.npz").touch()
-    (note,) = _missing({"mine": "mine-{task}"}, ["one", "two"])
+    (note,) = missing_files({"mine": "mine-{task}"}, ["one", "two"])
     assert note == "mine: there is no file mine-{task} for two"
-    assert not [*_from_files({"mine": "mine-{task}"}, "two", load_scene("planar"), trust=False)]
+    assert not [*from_files({"mine": "mine-{task}"}, "two", load_scene("planar"), trust=False)]
 
 
 @pytest.mark.parametrize(
