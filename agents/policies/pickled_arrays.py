@@ -56,6 +56,7 @@ class _Reader(pickle._Unpickler):
 
     stack: list[Any]
     append: Any  # of the stack
+    read: Any  # of the pickle
     pop_mark: Any
     dispatch: ClassVar[dict[int, Any]] = {
         code: handle
@@ -107,7 +108,16 @@ class _Reader(pickle._Unpickler):
             raise PickledError("has a key that is no text")
         self.stack[-1][key] = value
 
+    def _append_bytes(self) -> None:
+        # Python's own allocates what the pickle claims before it reads what there is.
+        size = int.from_bytes(self.read(8), "little")
+        content = self.read(size)
+        if len(content) < size:
+            raise PickledError("claims more bytes than it has")
+        self.append(bytearray(content))
+
     dispatch |= {
+        pickle.BYTEARRAY8[0]: _append_bytes,
         pickle.REDUCE[0]: _make,
         pickle.NEWOBJ[0]: _make,
         pickle.SETITEM[0]: _set_item,
@@ -163,9 +173,11 @@ def _rebuilt(value: Any) -> NDArray[np.float64] | None:
     else:
         _, shape, kind, is_fortran, content = value.state
         order = "F" if is_fortran else "C"
-    if isinstance(content, Inert) or kind.arguments[0] not in _KINDS or kind.state[1] not in "<>":
+    if not isinstance(content, bytes | bytearray):  # of a number, `bytes` would make as many zeros
         return None
-    numbers = np.frombuffer(bytes(content), dtype=kind.state[1] + kind.arguments[0])
+    if kind.arguments[0] not in _KINDS or kind.state[1] not in "<>":
+        return None
+    numbers = np.frombuffer(content, dtype=kind.state[1] + kind.arguments[0])
     if not all(isinstance(size, int) for size in shape) or math.prod(shape) != numbers.size:
         return None
     return numbers.reshape(shape, order=order).astype(np.float64)

@@ -1,6 +1,7 @@
 """Models trained in VecNormalize, or with rescaled actions, fly as they were trained, or are refused."""
 
 import pickle
+import tracemalloc
 from pathlib import Path
 
 import gymnasium
@@ -16,7 +17,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import DQSpaceArmVecEnv, SB3VecEnv, compare, evaluate, export_policy
-from agents.policies.pickled_arrays import as_array, read_pickled
+from agents.policies.pickled_arrays import PickledError, as_array, read_pickled
 from agents.wrappers import ShrinkActionSpace as SingleShrinkActionSpace
 from agents.wrappers.vector import ShrinkActionSpace
 from agents.zoo.finding import PolicyError, as_policy
@@ -258,6 +259,34 @@ def test_arrays_are_read_from_pickles(protocol):
         found = as_array(read_pickled(pickle.dumps({"here": array}, protocol=protocol))["here"])
         np.testing.assert_array_equal(found, array)
     assert as_array(read_pickled(pickle.dumps(np.array([None])))) is None
+
+
+class Zeros:
+    """Pickles as an array over a number, of which `bytes` would make as many zeros."""
+
+    def __init__(self, count):
+        self.count = count
+
+    def __reduce__(self):
+        make = np.zeros(0).__reduce_ex__(5)[0]  # `_frombuffer`, under NumPy's own name
+        return make, (self.count, np.dtype(np.float64), (self.count // 8,), "C")
+
+
+@pytest.mark.parametrize("content", [b"\x80\x05\x96%b.", None], ids=["bytes", "array"])
+def test_a_pickle_cannot_claim_memory_that_it_does_not_have(content):
+    claimed = 2**27
+    if content is not None:  # BYTEARRAY8, with a length alone
+        content = content.replace(b"%b", claimed.to_bytes(8, "little"))
+    tracemalloc.start()
+    try:
+        if content is None:
+            assert as_array(read_pickled(pickle.dumps(Zeros(claimed)))) is None
+        else:
+            with pytest.raises(PickledError, match="claims more bytes than it has"):
+                read_pickled(content)
+        assert tracemalloc.get_traced_memory()[1] < claimed / 8
+    finally:
+        tracemalloc.stop()
 
 
 def wrapped(scene, *wrap):
