@@ -73,7 +73,7 @@ class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any
         self._plans, self._scene, self._mismatch = Plans.of(demonstrations), scene, mismatch
         self._scale, self._power = np.asarray(action_scale, dtype=np.float64), cost_power
         self._observer = CorrectionObserver(scene, memory, full_authority)
-        self._rng = np.random.default_rng(seed)
+        self._rng, self._seed = np.random.default_rng(seed), seed
         self.num_envs = copies
         size = CorrectionObserver.size(self._worlds.kernels)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
@@ -101,7 +101,7 @@ class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any
             raise ValueError(f"options: {options}, should be None: all episodes begin together, at random")
         first = seed if seed is None or isinstance(seed, int | np.integer) else seed[0]
         if first is not None:
-            self._rng = np.random.default_rng(first)
+            self._rng, self._seed = np.random.default_rng(first), first
         return self._begin(), {}
 
     def _begin(self) -> NDArray[np.float32]:
@@ -112,8 +112,10 @@ class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any
         noise, push = self._rng.random((2, count))
         self._disturb(mismatch.noise * noise, mismatch.push * push)
         _, parameters = with_loads(self._scene, self._factors, self._plans.known)
-        # What diverges restarts at the next step, in some other world, and is not counted.
-        self._worlds.reset(options={"initial_state": self._plans.starts, "parameters": parameters})
+        # What diverges restarts at the next step, in some other world, and is not counted, but observed.
+        start = {"initial_state": self._plans.starts, "parameters": parameters}
+        self._worlds.reset(seed=self._seed, options=start)
+        self._seed = None  # the next episodes keep the generators
         self._stage, self._cost = 0, np.zeros(2 * count)
         self._flying, self._success = np.ones(2 * count, dtype=np.bool_), np.zeros(2 * count, dtype=np.bool_)
         self._observer.reset(self._plans.known[:count])

@@ -143,6 +143,25 @@ def test_a_flight_that_diverges_is_charged_for_the_rest(unscaled, small_scene):
     assert not total[1:].any()
 
 
+def test_what_follows_a_divergence_depends_on_the_seed_alone(configuration, small_scene, demonstrations):
+    """Learners see it, and a training would not repeat."""
+
+    def seen(asked):
+        environment = make_residual_environment(configuration(), small_scene, demonstrations)
+        if asked is not None:
+            environment.seed(asked)
+        environment.reset()
+        worlds = environment.vector_env.unwrapped._worlds
+        push = np.zeros((2 * COPIES, worlds.kernels.n_t))
+        push[0, worlds.kernels.layout.tangent.base_velocity] = 1e9
+        worlds.perturb(push)
+        idle = np.zeros((COPIES, worlds.kernels.n_u))
+        return [environment.step(idle)[0][0] for _ in range(2)]
+
+    for asked in (None, 7):  # by the constructor, and by the reset
+        np.testing.assert_array_equal(seen(asked), seen(asked))
+
+
 @pytest.mark.parametrize("name", ["demonstrations", "drawn"])
 def test_the_environment_and_the_controller_see_and_do_the_same(name, configuration, request):
     """A policy that corrects by what it sees costs the same in both, also where targets are drawn."""
