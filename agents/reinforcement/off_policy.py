@@ -101,7 +101,9 @@ class TwinDelayed(TD3):
     def deviation(self) -> float:
         """Current standard deviation of the noise, in action scales."""
         first, last = self.deviations
-        deviation: float = last + (first - last) * self._current_progress_remaining
+        # Negative where the copies gather more decisions before the last update than the schedule has left.
+        remaining = max(self._current_progress_remaining, 0.0)
+        deviation: float = last + (first - last) * remaining
         return deviation
 
     def _sample_action(

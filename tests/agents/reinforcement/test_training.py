@@ -208,12 +208,12 @@ def test_the_target_entropy_goes_linearly_to_its_end(algorithm, trained):
 def test_exploration_noise_goes_linearly_to_its_end(trained):
     model = trained("TD3").model
     chosen = model.policy.scale_action(model.predict(model._last_obs)[0])
-    for left in (1.0, 0.5, 0.0):
+    for left in (1.0, 0.5, 0.0, -0.6):  # negative beyond the schedule
         model._current_progress_remaining = left
         explored = [model._sample_action(0, n_envs=COPIES)[1] for _ in range(100)]
         noise = (np.array(explored) - chosen)[:, np.abs(chosen) < 0.2]
         assert noise.size > 500
-        assert noise.std() == pytest.approx(0.1 + 0.2 * left, rel=0.1)
+        assert noise.std() == pytest.approx(0.1 + 0.2 * max(left, 0.0), rel=0.1)
 
 
 @pytest.mark.sampled
