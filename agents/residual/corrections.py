@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from agents.evaluation.plans import FloatArray, Followed, Plans
 from agents.policies import ExportedPolicy
 from dq_space_arm_env import Kernels, Scene, compile_scene
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.rollouts import StateFeedback
 from dq_space_arm_env.task.step_report import n_observations
 
 SMALL = 0.02
 """Deviations below this size are observed nearly linearly, rad, m, rad/s, m/s."""
+_SETTINGS = {"action_scale", "repeat", "memory", "full_authority"}
+"""Of `correcting`, in the metadata of a policy."""
 
 
 class CorrectionObserver:
@@ -92,7 +96,32 @@ def correction_settings(policy: ExportedPolicy, scene: Scene) -> dict[str, Any]:
             f"policy: corrects scene {policy.metadata.get('scene')!r}, with {actual[0]} observed numbers "
             f"and {actual[1]} inputs; scene {scene.name!r} has {expected[0]} and {expected[1]}"
         )
+    _check_settings(settings, kernels.n_u)
     return dict(settings)
+
+
+def _check_settings(settings: Any, n_u: int) -> None:
+    """Refuse settings that no training has noted: anybody may have written the metadata of a policy."""
+    if not isinstance(settings, Mapping) or set(settings) != _SETTINGS:
+        wanted = ", ".join(sorted(_SETTINGS))
+        raise ValueError(f"policy: residual: {shortened(settings)}, should be a mapping of {wanted}")
+    repeat, scale = settings["repeat"], settings["action_scale"]
+    if isinstance(repeat, bool) or not isinstance(repeat, int) or repeat < 1:
+        raise ValueError(
+            f"policy: residual.repeat: {shortened(repeat)}, should be a whole number, at least 1"
+        )
+    for name in ("memory", "full_authority"):
+        if not _is_number(settings[name]) or settings[name] <= 0.0:
+            raise ValueError(f"policy: residual.{name}: {shortened(settings[name])}, should be positive")
+    scales: list[Any] = scale if isinstance(scale, list) and len(scale) == n_u else [None]
+    if not all(_is_number(each) and 0.0 <= each <= 1.0 for each in scales):
+        raise ValueError(
+            f"policy: residual.action_scale: {shortened(scale)}, should be {n_u} numbers from 0 to 1"
+        )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def correcting(

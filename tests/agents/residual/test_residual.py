@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -378,6 +379,28 @@ def test_a_policy_that_does_not_fit_is_refused(small_scene):
     message = r"policy: corrects scene 'small', with .* scene 'paper' has 78 and 12"
     with pytest.raises(ValueError, match=message):
         correction_settings(constant(small_scene), load_scene("paper"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (None, r"residual: \[\], should be a mapping of action_scale, full_authority, memory, repeat"),
+        ({"more": 1}, "residual: .* should be a mapping of"),
+        ({"repeat": 0}, "residual.repeat: 0, should be a whole number, at least 1"),
+        ({"repeat": "10"}, "residual.repeat: '10', should be a whole number"),
+        ({"memory": 0.0}, "residual.memory: 0.0, should be positive"),
+        ({"full_authority": float("nan")}, "residual.full_authority: nan, should be positive"),
+        ({"action_scale": [0.1]}, "residual.action_scale: .*0.1.*, should be 6 numbers from 0 to 1"),
+        ({"action_scale": [0.1] * 5 + ["a"]}, "should be 6 numbers from 0 to 1"),
+        ({"action_scale": [2.0] * 6}, "should be 6 numbers from 0 to 1"),
+        ({"action_scale": None}, "residual.action_scale: None, should be 6 numbers from 0 to 1"),
+    ],
+)
+def test_settings_that_no_training_notes_are_refused(changes, message, small_scene):
+    policy = constant(small_scene)
+    noted = [] if changes is None else policy.metadata["residual"] | changes
+    with pytest.raises(ValueError, match=message):
+        correction_settings(replace(policy, metadata={"residual": noted}), small_scene)
 
 
 MINIMAL = {"name": "small", "algorithm": {"name": "residual-PPO"}, "schedule": {"total_steps": 1000}}
