@@ -48,6 +48,10 @@ def shrunk(space: spaces.Space[Any], scene: Any, scale: ArrayLike | Mapping[str,
     """The box of an environment's actions with its bounds multiplied by `scale`, see `ShrinkActionSpace`."""
     if not isinstance(space, spaces.Box):
         raise TypeError(f"action space: {space}, should be a Box, whose bounds can be scaled")
+    if isinstance(scale, Mapping) and not isinstance(scene, Scene):
+        raise ValueError(
+            f"scale: {scale!r}, should be numbers for an environment without a scene's actuators"
+        )
     factors = (
         action_scale(scale, scene) if isinstance(scale, Mapping) else real_array("scale", scale, np.float32)
     )
@@ -69,7 +73,8 @@ def action_scale(scale: Mapping[str, float], scene: Scene) -> NDArray[np.float32
             raise ValueError(f"scale: no actuator is named {name!r}; {close}choose from {', '.join(own)}")
         if name not in own:
             raise ValueError(f"scale: scene {scene.name!r} has no {name}; choose from {', '.join(own)}")
-        values[getattr(layout.control, name)] = real_array(f"scale of {name}", value)
+        _check_number(f"scale of {name}", value)
+        values[getattr(layout.control, name)] = value
     return values
 
 

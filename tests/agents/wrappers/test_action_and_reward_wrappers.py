@@ -213,6 +213,16 @@ def test_vector_wrappers_pickle_with_their_episodes():
         (lambda env: RepeatAction(env, 2, discount="1"), TypeError, "discount: of type"),
         (lambda env: ShrinkActionSpace(env, "all"), TypeError, "scale: of type"),
         (lambda env: ShrinkActionSpace(env, {"base_force": None}), TypeError, "scale of base_force: of type"),
+        (
+            lambda env: ShrinkActionSpace(env, {"joint_torque": [0.1, 0.2]}),
+            TypeError,
+            r"scale of joint_torque: \[0.1, 0.2\], should be one number",
+        ),
+        (
+            lambda env: ShrinkActionSpace(gymnasium.make("Pendulum-v1"), {"joint_torque": 0.1}),
+            ValueError,
+            "should be numbers for an environment without a scene's actuators",
+        ),
         (lambda env: ShrinkActionSpace(env, {1: 0.5}), ValueError, "no actuator is named 1; choose from"),
         (lambda env: ShapeReward(env, scale="1"), TypeError, "scale: of type"),
         (lambda env: ShapeReward(env, scale=[1.0, 2.0]), TypeError, "scale: .*, should be one number"),
