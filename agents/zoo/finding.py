@@ -72,6 +72,8 @@ def as_policy(
         ImportError: If a model is given and the extra `agents`, or `onnx`, is not installed.
     """
     if isinstance(policy, ActingPolicy):
+        if normalize is not None:
+            raise PolicyError("normalize: the policy is ready to fly: give it where that is made")
         return policy if label is None else policy._replace(label=label)
     if isinstance(policy, str | Path):
         path, name = policy_path(policy), label or _label(policy)

@@ -99,6 +99,13 @@ def test_every_way_to_fly_a_normalized_model_normalizes(normalized, small_scene)
         np.testing.assert_allclose(acting.act(seen), expected, rtol=0.0, atol=2e-6)
 
 
+def test_a_policy_that_is_ready_to_fly_takes_no_statistics(normalized):
+    _, file, statistics = normalized
+    acting = as_policy(file, normalize=statistics)
+    with pytest.raises(PolicyError, match="normalize: the policy is ready to fly"):
+        as_policy(acting, normalize=statistics)
+
+
 def test_a_normalized_model_is_refused_without_its_statistics(normalized, small_file, tmp_path, capsys):
     _, file, statistics = normalized
     with pytest.raises(PolicyError, match=r"normalized by VecNormalize.*normalize=FILE"):
