@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -129,7 +130,7 @@ def compare(
     controllers: Sequence[str] = tuple(CONTROLLERS),
     conditions: Sequence[str] = ("training",),
     receding_starts: int = RECEDING_STARTS,
-    out: Path | None = None,
+    out: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     executor: Executor | None = None,
     trust: bool = False,
@@ -168,11 +169,13 @@ def compare(
         SceneError: If the scene cannot be loaded.
         PolicyError, PolicyFileError: If a policy is of no known kind, does not fit the scene, or cannot be
             read.
+        TypeError: If a text is given where a sequence should be.
         ValueError: If an argument is out of range or unknown, the scene does not suit demonstrations, or a
             condition does not suit the scene.
         DemonstrationsError: If processes are killed again and again; finished rows remain.
         KeyboardInterrupt: If the user interrupts it; likewise.
     """
+    check_sequences(policies=policies, controllers=controllers, conditions=conditions)
     _check("controllers", controllers, tuple(CONTROLLERS))
     _check("conditions", conditions, CONDITIONS)
     conditions = tuple(dict.fromkeys(conditions))
@@ -189,7 +192,7 @@ def compare(
         given.name if isinstance(scene, Scene) else str(scene),
         n,
         min(receding_starts, n),
-        KeptRows(out),
+        KeptRows(None if out is None else Path(out)),
         executor or local_executor(workers),
         trust,
         learning_curves,
@@ -429,6 +432,13 @@ def _commands(rows: Sequence[Row]) -> Iterator[str]:
             found.setdefault(flying, {})[condition] = None
     for command, conditions in found.items():
         yield " ".join([command, *conditions])
+
+
+def check_sequences(**given: object) -> None:
+    """Raise TypeError for a text or path where a sequence should be: of a text, each letter would count."""
+    for name, value in given.items():
+        if isinstance(value, str | os.PathLike):
+            raise TypeError(f"{name}: {str(value)!r}, should be a sequence: put it into a list")
 
 
 def _check(name: str, given: Sequence[str], known: Sequence[str]) -> None:

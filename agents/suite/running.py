@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from agents.configuration import AgentConfiguration
-from agents.evaluation.comparing import compare
+from agents.evaluation.comparing import check_sequences, compare
 from agents.evaluation.conditions import scene_under
 from agents.evaluation.evaluating import Advance as Step
 from agents.evaluation.plan_followers import CONTROLLERS
@@ -42,7 +43,7 @@ def run_suite(
     policies: Mapping[str, Callable[[Scene], Any]] = MappingProxyType({}),
     tasks: Sequence[str] = (),
     seeds: int | None = None,
-    out: Path = Path("results") / "suite",
+    out: str | os.PathLike[str] = Path("results") / "suite",
     workers: int | None = None,
     executor: Executor | None = None,
     trust: bool = False,
@@ -74,11 +75,13 @@ def run_suite(
         SuiteError: If the suite or a task is not what it should be, two entrants have one name, or nobody can
             fly.
         ConfigurationError, PolicyError, PolicyFileError: If an entrant cannot be used.
+        TypeError: If a text is given where a sequence should be.
         ValueError: If a condition does not suit a task.
         DemonstrationsError: If processes of the expert are killed again and again; finished rows remain.
         KeyboardInterrupt: If the user interrupts it; likewise.
     """
-    chosen = load_suite(suite)
+    check_sequences(entrants=entrants, tasks=tasks)
+    chosen, out = load_suite(suite), Path(out)
     scenes = {task: chosen.scene(task) for task in tasks or chosen.tasks}
     for scene in scenes.values():
         for condition in chosen.conditions:

@@ -252,7 +252,7 @@ def test_finished_rows_are_taken_up(tmp_path, monkeypatch, quick):
 
     monkeypatch.setattr("agents.evaluation.comparing.evaluate", refuse)
     monkeypatch.setattr("agents.evaluation.comparing.fly_plans", refuse)
-    again = compare([run], quick, 3, **arguments)
+    again = compare([run], quick, 3, **arguments | {"out": str(tmp_path / "out")})
     assert json.dumps(record(again)) == json.dumps(record(first))
     (tmp_path / "out" / "rows" / files[1]).write_text("{")
     with pytest.raises(AssertionError, match="evaluated again"):
@@ -318,6 +318,10 @@ def test_policies_have_names_apart_from_each_other_and_from_controllers():
 def test_what_cannot_be_compared_is_refused(quick):
     with pytest.raises(ValueError, match="controllers: 'magic' is unknown; choose from open-loop, gains"):
         compare(scene=quick, controllers=("magic",))
+    with pytest.raises(TypeError, match="policies: 'ppo', should be a sequence: put it into a list"):
+        compare("ppo", scene=quick)
+    with pytest.raises(TypeError, match="conditions: 'push', should be a sequence"):
+        compare(scene=quick, conditions="push")
     with pytest.raises(ValueError, match="there is nothing to compare"):
         compare(scene=quick, controllers=())
     with pytest.raises(ValueError, match="receding_starts: 0, should be a whole number"):

@@ -100,6 +100,8 @@ def test_unknown_names_are_refused(content):
         load_suite("v0")
     with pytest.raises(SuiteError, match="task: 'nowhere' is unknown"):
         run_suite(["gains"], suite, tasks=["nowhere"])
+    with pytest.raises(TypeError, match="entrants: 'gains', should be a sequence: put it into a list"):
+        run_suite("gains", suite)
     with pytest.raises(PolicyError, match="zoo has no policy 'magic'"):
         run_suite(["magic"], suite)
     with pytest.raises(SuiteError, match="there is no such file"):
@@ -223,7 +225,7 @@ def test_entrants_of_all_kinds_fly_and_finished_ones_are_kept(
 ):
     pytest.importorskip("threadpoolctl")
     suite, out, executor = Suite.model_validate(content), tmp_path / "out", counting()
-    fly = partial(run_suite, suite=suite, policies={"still": still}, out=out, executor=executor)
+    fly = partial(run_suite, suite=suite, policies={"still": still}, out=str(out), executor=executor)
     run = fly(["open-loop", "gains", "tiny"])
     names = ["open-loop plan", "plan with gains", "tiny", "still"]
     assert [score.entrant for score in run.scores[:4]] == names
