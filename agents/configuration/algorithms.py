@@ -9,11 +9,13 @@ from agents.configuration.schema import MOST_IN_MEMORY, DemonstrationSource, Few
 from dq_space_arm_env.validation import (
     Count,
     Finite,
+    FiniteOrAuto,
     Flag,
     Fraction,
     Model,
     NonNegative,
     Positive,
+    PositiveOrAuto,
     Problem,
     count_up_to,
 )
@@ -133,11 +135,11 @@ class OffPolicy(_Common):
 
 
 class _MaximumEntropy(OffPolicy):
-    ent_coef: Positive | Literal["auto"] = Field(
+    ent_coef: PositiveOrAuto = Field(
         default="auto", description="weight of the entropy, or 'auto' to learn it"
     )
     ent_coef_init: Positive = Field(default=0.1, description="initial weight of the entropy if it is learned")
-    target_entropy: Finite | Literal["auto"] = Field(
+    target_entropy: FiniteOrAuto = Field(
         default="auto", description="entropy it is learned for; 'auto': minus the number of actions"
     )
     final_target_entropy: Finite | None = Field(

@@ -103,6 +103,8 @@ def load_search_space(path: str | Path, configuration: AgentConfiguration) -> Se
     """
     try:
         data = read_yaml(path)
+        if not isinstance(data, dict):
+            raise ConfigurationError(f"{path}: must be a mapping (key: value) at the top")
         space = SearchSpace.model_validate(data)
     except UnreadableError as error:
         raise ConfigurationError(str(error)) from error

@@ -139,7 +139,10 @@ def load_suite(source: str | Path | Suite = "v1") -> Suite:
     if source not in shipped and path.suffix not in (".yaml", ".yml"):
         raise SuiteError(f"suite: {str(source)!r}, should be one of {', '.join(shipped)}, or a YAML file")
     try:
-        return Suite.model_validate(read_yaml(path))
+        data = read_yaml(path)
+        if not isinstance(data, dict):
+            raise SuiteError(f"{path}: must be a mapping (key: value) at the top")
+        return Suite.model_validate(data)
     except UnreadableError as error:
         raise SuiteError(str(error)) from error
     except YAMLError as error:

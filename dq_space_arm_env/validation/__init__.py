@@ -4,10 +4,12 @@ from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.validation.fields import (
     Count,
     Finite,
+    FiniteOrAuto,
     Flag,
     Fraction,
     NonNegative,
     Positive,
+    PositiveOrAuto,
     Vector3,
     count_up_to,
 )
@@ -24,11 +26,13 @@ from dq_space_arm_env.validation.yaml_text import (
 __all__ = [
     "Count",
     "Finite",
+    "FiniteOrAuto",
     "Flag",
     "Fraction",
     "Model",
     "NonNegative",
     "Positive",
+    "PositiveOrAuto",
     "Problem",
     "Vector3",
     "YAMLError",

@@ -85,38 +85,32 @@ def _real(value: Any) -> float:
         return math.nan
 
 
-def _number(good: Callable[[float], bool], wanted: str, span: Range = ANY) -> BeforeValidator:
-    """Accept a number with a property."""
+def _number(
+    good: Callable[[float], bool], wanted: str, span: Range = ANY, *, word: str | None = None
+) -> BeforeValidator:
+    """Accept a number with a property, or a word."""
+    allowed = wanted if word is None else f"{wanted}, or {word}"
 
-    def read(value: Any) -> float:
+    def read(value: Any) -> float | str:
+        if isinstance(value, str) and value == word:
+            return value
         number = _real(value)
         if not good(number):
-            raise problem(f"must be {wanted}")
+            raise problem(f"must be {allowed}")
         span.check(number)
         return number
 
     return BeforeValidator(read)
 
 
-def positive(span: Range) -> BeforeValidator:
-    """Accept a positive number in a range."""
-    return _number(lambda n: 0 < n < math.inf, "a finite number greater than 0", span)
+def positive(span: Range, *, word: str | None = None) -> BeforeValidator:
+    """Accept a positive number in a range, or a word."""
+    return _number(lambda n: 0 < n < math.inf, "a finite number greater than 0", span, word=word)
 
 
 def non_negative(span: Range) -> BeforeValidator:
     """Accept zero, or a positive number in a range."""
     return _number(lambda n: 0 <= n < math.inf, "a finite number, 0 or greater", span)
-
-
-def _number_or_off(value: Any) -> float | str:
-    """Accept a positive number, or the word off."""
-    if isinstance(value, str) and value == "off":
-        return value
-    number = _real(value)
-    if not 0 < number < math.inf:
-        raise problem("must be a finite number greater than 0, or off")
-    ANY.check(number)
-    return number
 
 
 def count_up_to(most: int) -> BeforeValidator:
@@ -194,7 +188,11 @@ Name = Annotated[StrictStr, Field(min_length=1), AfterValidator(_name)]
 Flag = Annotated[bool, BeforeValidator(_flag)]
 Finite = Annotated[float, _number(math.isfinite, "a finite number", UP_TO)]
 Positive = Annotated[float, positive(ANY)]
-PositiveOrOff = Annotated[float | Literal["off"], BeforeValidator(_number_or_off)]
+PositiveOrOff = Annotated[float | Literal["off"], positive(ANY, word="off")]
+PositiveOrAuto = Annotated[float | Literal["auto"], positive(ANY, word="auto")]
+FiniteOrAuto = Annotated[
+    float | Literal["auto"], _number(math.isfinite, "a finite number", UP_TO, word="auto")
+]
 NonNegative = Annotated[float, non_negative(UP_TO)]
 Fraction = Annotated[float, _number(lambda n: 0 <= n < 1, "a fraction: 0 or greater, and less than 1", UP_TO)]
 Count = Annotated[int, count_up_to(_MOST_COUNT)]

@@ -82,6 +82,9 @@ def test_unknown_keys_are_refused_with_a_suggestion():
     [
         ({"algorithm": {"name": "DQN"}}, "it must be one of PPO, SAC, TQC, TD3, APG, cloning, dagger, act"),
         ({"algorithm": {"name": "PPO", "gamma": 1.5}}, "gamma = 1.5: must be a fraction"),
+        ({"algorithm": {"name": "SAC", "ent_coef": "autoo"}}, ".ent_coef = 'autoo': must be a finite"),
+        ({"algorithm": {"name": "TQC", "ent_coef": 0.0}}, "must be a finite number greater than 0, or auto"),
+        ({"algorithm": {"name": "SAC", "target_entropy": "x"}}, "must be a finite number, or auto ("),
         (
             {"algorithm": {"name": "SAC", "buffer_size": 10, "learning_starts": 20}},
             "learning_starts = 20: must be at most buffer_size, which is 10",

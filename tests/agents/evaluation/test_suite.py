@@ -92,6 +92,9 @@ def test_wrong_files_are_refused_in_words(content, tmp_path, change, sentence):
     file.write_text(json.dumps({**content, **change}))  # JSON is YAML
     with pytest.raises(SuiteError, match=sentence):
         load_suite(file)
+    file.write_text("- planar")
+    with pytest.raises(SuiteError, match=r"wrong\.yaml: must be a mapping"):
+        load_suite(file)
 
 
 def test_unknown_names_are_refused(content):

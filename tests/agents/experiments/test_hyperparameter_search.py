@@ -259,6 +259,9 @@ def test_wrong_spaces_are_named(
     with pytest.raises(ConfigurationError, match=message.replace("?", r"\?")) as caught:
         load_search_space(path, configuration)
     assert str(path) in str(caught.value)
+    path.write_text("[search]\n")
+    with pytest.raises(ConfigurationError, match=r"space\.yaml: must be a mapping"):
+        load_search_space(path, configuration)
 
 
 def test_values_go_where_their_keys_point(configuration: AgentConfiguration) -> None:
