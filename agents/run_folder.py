@@ -94,6 +94,12 @@ class RunFolder:
                     f"{path} was started with another configuration: {'; '.join(found)}. Use that one, or "
                     "use another folder (--out)"
                 )
+            before, now = (each.get("schedule", {}).get("total_steps", 0) for each in (there, here))
+            if now < before and has_begun:
+                raise RunFolderError(
+                    f"{path} was started with schedule.total_steps: {before}, which may become larger, not "
+                    f"{now}: use another folder (--out)"
+                )
         # A configuration only names its scene; the file of that name may have changed.
         scene = load_scene(configuration.scene).content_hash()
         starts = self._starts()

@@ -11,12 +11,12 @@ from dq_space_arm_env.validation import (
     Finite,
     FiniteOrAuto,
     Flag,
-    Fraction,
     Model,
     NonNegative,
     Positive,
     PositiveOrAuto,
     Problem,
+    Share,
     count_up_to,
 )
 
@@ -27,13 +27,13 @@ class _Common(Model):
         default=None, description="final step size, reached linearly; absent: learning_rate"
     )
     batch_size: Many = Field(default=256, description="decisions per minibatch")
-    gamma: Fraction = Field(default=0.98, description="discount per decision")
+    gamma: Share = Field(default=0.98, description="discount per decision")
 
 
 class Lagrangian(Model):
     """Price of violating the scene's constraints, by dual ascent (PPO-Lagrangian, Ray et al., 2019)."""
 
-    limit: Fraction = Field(default=0.01, description="share of the episodes that may violate constraints")
+    limit: Share = Field(default=0.01, description="share of the episodes that may violate constraints")
     initial: Positive = Field(
         default=5e-4, description="multiplier at first and at least: a price in units of the shaped rewards"
     )
@@ -51,7 +51,7 @@ class PPO(_Common):
     batch_size: Many = Field(default=4096, description="decisions per minibatch")
     n_steps: Many = Field(default=50, description="decisions of each copy between updates")
     n_epochs: Few = Field(default=10, description="passes over these decisions per update")
-    gae_lambda: Fraction = Field(default=0.95, description="decay of the advantage estimate")
+    gae_lambda: Share = Field(default=0.95, description="decay of the advantage estimate")
     clip_range: Positive = Field(default=0.2, description="largest change of a probability ratio")
     ent_coef: NonNegative = Field(default=0.0, description="weight of the entropy")
     vf_coef: Positive = Field(default=0.5, description="weight of the value function's loss")

@@ -18,10 +18,10 @@ from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.validation import (
-    Fraction,
     Model,
     NonNegative,
     Problem,
+    Share,
     YAMLError,
     count_up_to,
     did_you_mean,
@@ -43,8 +43,8 @@ class SuiteError(ValueError):
 class Limits(Model):
     """What a controller has to keep to solve a task."""
 
-    success: Fraction = Field(description="least share of flights that reach the target")
-    violating: Fraction = Field(description="largest share of flights that violate a constraint")
+    success: Share = Field(description="least share of flights that reach the target")
+    violating: Share = Field(description="largest share of flights that violate a constraint")
     cost_gap: NonNegative = Field(description="largest interquartile mean of J / J_expert - 1")
 
     def are_kept(self, success: float, violating: float | None, cost_gap: float | None) -> bool:

@@ -142,6 +142,11 @@ class Shaping(NamedTuple):
 
     def of_ends(self, info: Mapping[str, Any]) -> NDArray[np.float32]:
         """Rewards of the ends of episodes, shape (B,), from columns of their last infos."""
+        if "is_success" not in info:
+            raise ValueError(
+                f"success_reward: {self.success_reward!r}, should be 0: the environment's info has no "
+                "is_success at the end of an episode"
+            )
         earned = self.success_reward * np.asarray(info["is_success"], dtype=np.float64)
         if self.end_error_cost:
             limits = zip(ERRORS, self.tolerances, strict=True)

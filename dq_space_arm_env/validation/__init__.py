@@ -10,6 +10,7 @@ from dq_space_arm_env.validation.fields import (
     NonNegative,
     Positive,
     PositiveOrAuto,
+    Share,
     Vector3,
     count_up_to,
 )
@@ -34,6 +35,7 @@ __all__ = [
     "Positive",
     "PositiveOrAuto",
     "Problem",
+    "Share",
     "Vector3",
     "YAMLError",
     "count_up_to",

@@ -195,6 +195,7 @@ FiniteOrAuto = Annotated[
 ]
 NonNegative = Annotated[float, non_negative(UP_TO)]
 Fraction = Annotated[float, _number(lambda n: 0 <= n < 1, "a fraction: 0 or greater, and less than 1", UP_TO)]
+Share = Annotated[float, _number(lambda n: 0 <= n <= 1, "a number from 0 to 1", UP_TO)]
 Count = Annotated[int, count_up_to(_MOST_COUNT)]
 Vector3 = Annotated[Three, _vector(3)]
 

@@ -81,7 +81,7 @@ def test_unknown_keys_are_refused_with_a_suggestion():
     ("changes", "sentence"),
     [
         ({"algorithm": {"name": "DQN"}}, "it must be one of PPO, SAC, TQC, TD3, APG, cloning, dagger, act"),
-        ({"algorithm": {"name": "PPO", "gamma": 1.5}}, "gamma = 1.5: must be a fraction"),
+        ({"algorithm": {"name": "PPO", "gamma": 1.5}}, "gamma = 1.5: must be a number from 0 to 1"),
         ({"algorithm": {"name": "SAC", "ent_coef": "autoo"}}, ".ent_coef = 'autoo': must be a finite"),
         ({"algorithm": {"name": "TQC", "ent_coef": 0.0}}, "must be a finite number greater than 0, or auto"),
         ({"algorithm": {"name": "SAC", "target_entropy": "x"}}, "must be a finite number, or auto ("),

@@ -53,6 +53,11 @@ def test_another_configuration_is_refused_but_for_its_length_and_description(
     before = contents(tmp_path)
     with pytest.raises(RunFolderError, match=r"another configuration: .*name"):
         RunFolder(tmp_path, configuration.model_copy(update={"name": "another"}))
+    shorter = schedule.model_copy(update={"total_steps": schedule.total_steps - 1})
+    with pytest.raises(
+        RunFolderError, match=r"total_steps: \d+, which may become larger, not \d+: use another"
+    ):
+        RunFolder(tmp_path, configuration.model_copy(update={"schedule": shorter}))
     starts = json.loads(before["provenance.json"])
     starts[0]["scene_hash"] = "0" * 64
     (tmp_path / "provenance.json").write_text(json.dumps(starts))

@@ -255,3 +255,10 @@ def test_vector_environments_that_cannot_wait_are_refused():
     with pytest.raises(TypeError, match=r"RecordEpisodeStatistics inside RepeatAction .* put it around"):
         vector.RepeatAction(counting, 2)
     RepeatAction(RecordEpisodeStatistics(gymnasium.make("DQSpaceArm-v0", scene=EIGHT_STEPS)), 2)
+
+
+def test_success_has_no_reward_where_nothing_tells_it():
+    env = ShapeReward(gymnasium.make("CartPole-v1", max_episode_steps=1), success_reward=1.0)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"success_reward: 1.0, should be 0: .* no is_success"):
+        env.step(0)
