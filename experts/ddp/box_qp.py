@@ -144,18 +144,23 @@ def _change_sides(
     n_free: int,
     work: BoxQPWorkspace,
 ) -> bool:
-    """Hold what leaves the box, free what the slope pulls into it; tell whether there is anything such."""
+    """Hold what leaves the box, free what the slope pulls into it; tell whether there is anything such.
+
+    Without room a component is held even where no slope does: its gains would promise what it cannot do.
+    """
     size, changed = gradient.shape[0], False
     if n_free < size:
         _evaluate(hessian, gradient, work.trial, work)
     for i in range(size):
-        side = work.sides[i]
+        side, has_room = work.sides[i], lower[i] != upper[i]
         if side == 0:
             if work.trial[i] < lower[i]:
                 work.sides[i] = -1
             elif work.trial[i] > upper[i]:
                 work.sides[i] = 1
-        elif not side * work.slope[i] < 0.0:
+            elif not has_room:
+                work.sides[i] = -1
+        elif not side * work.slope[i] < 0.0 and (has_room or work.slope[i] != 0.0):
             work.sides[i] = 0
         changed = changed or work.sides[i] != side
     return changed
@@ -226,13 +231,15 @@ def _list_free(work: BoxQPWorkspace) -> int:
 
 @part
 def _find_sides(lower: FloatArray, upper: FloatArray, point: FloatArray, work: BoxQPWorkspace) -> None:
-    """Hold the components that the slope at a point pushes out of the box."""
+    """Hold the components that the slope at a point pushes out of the box, or that have no room."""
     for i in range(point.shape[0]):
         slope, side = work.slope[i], 0
         if point[i] == lower[i] and slope > 0.0:
             side = -1
         elif point[i] == upper[i] and slope < 0.0:
             side = 1
+        elif lower[i] == upper[i]:
+            side = -1
         work.sides[i] = side
 
 

@@ -52,6 +52,18 @@ def test_unconstrained_problem_is_solved_in_one_unregularized_step(system):
     np.testing.assert_allclose(solution.controls[0], gains[0] @ x0, rtol=1e-9)
 
 
+def test_gains_at_rest_do_not_count_on_an_input_without_room(coupled_masses):
+    held = 1
+    problem, others = coupled_masses.problem(), np.arange(3) != held
+    problem.control_lower[held] = problem.control_upper[held] = 0.0
+    gains, _ = riccati_gains(
+        replace(coupled_masses, B=coupled_masses.B[:, others], R=coupled_masses.R[others][:, others])
+    )
+    solution = BoxDDP(problem).solve(np.zeros(4))
+    assert not solution.feedback_gains[:, held].any()
+    np.testing.assert_allclose(solution.feedback_gains[:, others], gains, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("initial_regularization", [0.0, 1.0, 1e4])
 def test_first_step_achieves_the_predicted_reduction(system, initial_regularization):
     solver = BoxDDP(system.problem(), initial_regularization=initial_regularization)

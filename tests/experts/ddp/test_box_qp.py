@@ -102,6 +102,15 @@ def test_component_on_its_bound_without_slope_stays_free() -> None:
     assert free.tolist() == [0]
 
 
+@pytest.mark.parametrize("curvature", [2.0, -2.0])
+def test_component_without_room_is_held_where_no_slope_holds_it(curvature: float) -> None:
+    limits = np.array([1.0, 0.0])
+    status, x, free, _ = solve(np.array([[2.0, 1.0], [1.0, curvature]]), np.zeros(2), -limits, limits)
+    assert status == SOLVED
+    assert x.tolist() == [0.0, 0.0]
+    assert free.tolist() == [0]
+
+
 @pytest.mark.parametrize("factor", [1e-20, 1e20])
 def test_result_does_not_depend_on_the_unit_of_the_cost(factor: float) -> None:
     hessian, gradient, lower, upper = random_problem(1)
