@@ -10,6 +10,7 @@ import numpy as np
 
 from dq_space_arm_env.kernels.bound import buffer_table
 from experts.ddp.backward_pass import Update
+from experts.ddp.rollout import is_finite
 from experts.native.compilation import BufferTable, call_kernel, compiled, part
 from experts.native.padded_algebra import FloatArray, set_product_sum
 from experts.problems.shooting_problem import RateLimits, ShootingProblem, native_calls, rate_limits
@@ -151,6 +152,8 @@ def _roll_out(
         alive = False
         for lane in range(LANES):
             work.totals[lane] += work.stage_costs[k, lane]
+            if not is_finite(work.states[k + 1, lane]):
+                work.totals[lane] = np.inf
             alive = alive or np.isfinite(work.totals[lane])
         if not alive:
             break

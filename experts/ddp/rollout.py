@@ -40,7 +40,7 @@ def rollout(
     for k in range(stage_costs.shape[0]):
         call_kernel(step, k, k + 1, step_buffers)
         total += stage_costs[k]
-        if not (np.isfinite(total) and _is_finite(states[k + 1])):
+        if not (np.isfinite(total) and is_finite(states[k + 1])):
             return np.inf, k
     return _add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
 
@@ -92,7 +92,7 @@ def closed_loop_rollout(
         if retract != NO_RETRACTION:
             call_kernel(retract, k, k + 1, retract_buffers)
         total += stage_costs[k]
-        if not (np.isfinite(total) and _is_finite(states[k + 1])):
+        if not (np.isfinite(total) and is_finite(states[k + 1])):
             return np.inf, k
     return _add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
 
@@ -114,7 +114,7 @@ def _add_terminal(
 
 
 @inlined
-def _is_finite(row: FloatArray) -> bool:
+def is_finite(row: FloatArray) -> bool:
     """Whether all numbers of a row are finite."""
     finite = True
     for i in range(row.shape[0]):

@@ -64,6 +64,21 @@ def test_gains_at_rest_do_not_count_on_an_input_without_room(coupled_masses):
     np.testing.assert_allclose(solution.feedback_gains[:, others], gains, rtol=1e-9, atol=1e-12)
 
 
+def test_no_step_leads_to_states_that_are_not_finite_even_where_they_cost_nothing(double_integrator):
+    system = replace(double_integrator, A=np.eye(2), B=np.eye(2, 1), Q=np.zeros((2, 2)), R=1e-6 * np.eye(1))
+    problem = replace(
+        replace(system, P=np.diag([1.0, 0.0]), horizon=4, initial_state=np.array([4.0, 0.0])).problem(),
+        step=lambda x, u, h: np.array([x[0] + u[0], x[1] if x[0] > 2.0 else np.inf]),
+        cost=lambda x, u: 0.5e-6 * u @ u,
+        terminal_cost=lambda x: 0.5 * x[0] ** 2,
+        difference=lambda reference, x: np.array([x[0] - reference[0], 0.0]),
+    )
+    solution = BoxDDP(problem, initial_regularization=0.0).solve()
+    assert solution.cost < 4.0
+    assert np.isfinite(solution.states).all()
+    assert not solution.converged
+
+
 @pytest.mark.parametrize("initial_regularization", [0.0, 1.0, 1e4])
 def test_first_step_achieves_the_predicted_reduction(system, initial_regularization):
     solver = BoxDDP(system.problem(), initial_regularization=initial_regularization)
