@@ -321,7 +321,7 @@ class FeedbackPolicy:
     """The feedback policy of a solution; it owns its buffers, so give each thread its own."""
 
     def __init__(self, solution: Solution, problem: ShootingProblem) -> None:
-        horizon = solution.controls.shape[0]
+        horizon = problem.horizon
         expected = (horizon, problem.n_controls, problem.n_tangent)
         if solution.feedback_gains.shape != expected or solution.states.shape[1] != problem.n_states:
             raise ValueError(

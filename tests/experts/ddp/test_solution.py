@@ -1,6 +1,7 @@
 import copy
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -113,8 +114,11 @@ def test_loaded_solution_needs_a_problem_for_its_policy(solution, unicycle, pend
     loaded = Solution.load(tmp_path / "solution.npz")
     with pytest.raises(ValueError, match=r"policy\(problem\)"):
         loaded.policy()
-    with pytest.raises(ValueError, match=r"the problem needs gains \(80, 1, 2\)"):
+    with pytest.raises(ValueError, match=r"the problem needs gains \(120, 1, 2\)"):
         loaded.policy(pendulum)
+    for horizon in (79, 81):
+        with pytest.raises(ValueError, match=rf"the problem needs gains \({horizon}, 2, 3\)"):
+            loaded.policy(replace(unicycle, horizon=horizon))
     state = solution.states[3] * 1.01
     np.testing.assert_array_equal(loaded.policy(unicycle)(state, 3), solution.policy()(state, 3))
 
