@@ -37,7 +37,13 @@ from experts.guesses.policies import coarsened, follow, refined, track
 from experts.guesses.preparation import Preparation, keep_preparation, preparation_key, read_preparation
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
 from experts.problems.arm_problem import ArmProblem
-from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, check_whole
+from experts.problems.shooting_problem import (
+    FloatArray,
+    ShootingProblem,
+    check_array,
+    check_at_least,
+    check_whole,
+)
 from experts.problems.window_problem import WindowProblem
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
@@ -114,8 +120,9 @@ class GuidedDDP:
         """
         check_whole("remember", remember, 0)
         check_whole("attempts", attempts, 1)
-        if not 0.0 <= reserve < 0.5:
-            raise ValueError(f"reserve is {reserve}; it must be at least 0 and less than 0.5")
+        check_at_least("reserve", reserve, 0.0)
+        if reserve >= 0.5:
+            raise ValueError(f"reserve is {reserve}; it must be less than 0.5")
         self._settings: dict[str, Any] = {
             "max_iterations": max_iterations,
             "tolerance": tolerance,

@@ -256,8 +256,10 @@ def check_problem(problem: ShootingProblem) -> None:
     for name in ("n_states", "n_tangent", "n_controls", "horizon"):
         if getattr(problem, name) < 1:
             raise ValueError(f"{name} is {getattr(problem, name)}; a problem needs at least 1")
-    if not (np.isfinite(problem.time_step) and problem.time_step > 0.0):
-        raise ValueError(f"time_step is {problem.time_step}; it must be a positive number of seconds")
+    if not (_is_number(problem.time_step) and 0.0 < problem.time_step < np.inf):
+        raise ValueError(
+            f"time_step is {shortened(problem.time_step)}; it must be a positive number of seconds"
+        )
     for name in ("control_lower", "control_upper"):
         bound = np.asarray(getattr(problem, name))
         if bound.shape not in ((problem.n_controls,), (problem.horizon, problem.n_controls)):
@@ -306,9 +308,13 @@ def check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
 
 
 def check_at_least(name: str, value: float, smallest: float) -> None:
-    """Refuse a setting that is too small, infinite or NaN."""
-    if not smallest <= value < np.inf:
-        raise ValueError(f"{name} is {value}; it must be finite, at least {smallest}")
+    """Refuse a setting that is no number, too small, infinite or NaN."""
+    if not (_is_number(value) and smallest <= value < np.inf):
+        raise ValueError(f"{name} is {shortened(value)}; it must be a finite number, at least {smallest}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float | int | np.floating | np.integer) and not isinstance(value, bool)
 
 
 def check_whole(name: str, value: int, smallest: int) -> None:

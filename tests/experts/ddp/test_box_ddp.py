@@ -420,7 +420,9 @@ def test_a_start_of_anything_but_real_numbers_is_refused(pendulum, arguments):
         ({"max_iterations": 2.5}, "max_iterations is 2.5; it must be a whole number"),
         ({"threads": True}, "threads is True; it must be a whole number, at least 1"),
         ({"tolerance": np.nan}, "tolerance is nan"),
-        ({"tolerance": np.inf}, "tolerance is inf; it must be finite, at least 0"),
+        ({"tolerance": np.inf}, "tolerance is inf; it must be a finite number, at least 0"),
+        ({"tolerance": "1e-7"}, "tolerance is '1e-7'; it must be a finite number"),
+        ({"initial_regularization": None}, "initial_regularization is None"),
         ({"plateau_decrease": -1e-9}, "plateau_decrease is -1e-09"),
         ({"plateau_iterations": 0}, "plateau_iterations is 0"),
         ({"initial_regularization": -1.0}, "initial_regularization is -1.0"),
@@ -436,6 +438,7 @@ def test_wrong_setting_is_refused(pendulum, settings, message):
     [
         ({"horizon": 0}, "horizon is 0"),
         ({"time_step": -0.1}, "time_step is -0.1"),
+        ({"time_step": "fast"}, "time_step is 'fast'"),
         ({"control_lower": np.zeros(2)}, r"control_lower has shape \(2,\); expected \(1,\)"),
         ({"control_lower": np.array([6.0])}, r"input 0 has bounds \[6\.0, 5\.0\]"),
         ({"control_upper": np.array([np.nan])}, r"input 0 has bounds \[-5\.0, nan\]"),

@@ -245,6 +245,8 @@ def test_an_interrupt_leaves_no_half_made_library(unicycle, monkeypatch):
         ({"attempts": 0}, "attempts is 0; it must be a whole number, at least 1"),
         ({"attempts": 1.5}, "attempts is 1.5; it must be a whole number"),
         ({"max_iterations": -1}, "max_iterations is -1"),
+        ({"reserve": 0.5}, "reserve is 0.5; it must be less than 0.5"),
+        ({"reserve": "some"}, "reserve is 'some'"),
         ({"second_order": "some"}, "second_order is 'some'"),
     ],
 )
