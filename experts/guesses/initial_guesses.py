@@ -56,13 +56,14 @@ def ranked_guesses(
     kinematic_guess: KinematicGuess | None,
 ) -> list[Guess]:
     """List the guesses from a start whose rollouts are finite, the cheapest first."""
-    has_constraints = getattr(problem, "constraints", None) is not None
+    constraints = getattr(problem, "constraints", None)
     rollouts, strayed = [], True
     for i, solution in enumerate(library):
         for name, policy in policies(solution, problem).items():
             trial = follow(policy, problem, start)
             guess = Guess(f"policy {i}{name}", trial.controls, trial.cost, POLICY_REGULARIZATION)
-            if has_constraints:
+            # A similar problem may have other constraints.
+            if constraints is not None and solution.multipliers.shape == constraints.multipliers.shape:
                 guess = guess._replace(multipliers=multipliers_of(solution))
             rollouts.append(guess)
             strayed = strayed and trial.cost > STRAYED * solution.cost

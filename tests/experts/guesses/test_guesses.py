@@ -1,6 +1,8 @@
 """The guessing expert: policies of solved maneuvers as guesses, what wins, and what it says about it."""
 
+from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -22,7 +24,7 @@ from dq_space_arm_env.scene.start import (
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.demonstrations.outcomes import GUESSES
 from experts.guesses.guided import START_REGULARIZATIONS
-from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION
+from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION, ranked_guesses
 from experts.guesses.other_side import contacts_of, other_side
 from experts.guesses.policies import coarsened, follow, refined
 from experts.guesses.preparation import preparation_key
@@ -89,6 +91,15 @@ def test_an_empty_library_leaves_zero_controls(unicycle):
     expected = BoxDDP(unicycle, initial_regularization=ZERO_REGULARIZATION).solve(ELSEWHERE)
     assert names(solution) == [solution.metadata["guess"]] == ["zero controls"]
     np.testing.assert_array_equal(solution.controls, expected.controls)
+
+
+def test_a_library_with_other_constraints_gives_policies_without_multipliers(unicycle):
+    solution = replace(BoxDDP(unicycle).solve(), multipliers=np.ones((81, 2)))
+    for rows, known in ((2, True), (5, False)):
+        constrained = copy(unicycle)
+        constrained.constraints = SimpleNamespace(multipliers=np.zeros((81, rows)))
+        (guess,) = ranked_guesses(constrained, ELSEWHERE, [solution], None)
+        assert (guess.multipliers is not None) is known
 
 
 def with_screw_motion(solver, states, controls):
