@@ -40,6 +40,7 @@ from experts.problems.shooting_problem import (
     check_array,
     check_at_least,
     check_control_weights,
+    check_state,
     check_whole,
     stage_bounds,
 )
@@ -356,8 +357,8 @@ class BoxDDP:
         lower, upper = stage_bounds(problem)
         state = real_array("x0", problem.initial_state if x0 is None else x0, np.float64)
         check_array("x0", state, (problem.n_states,))
-        if x0 is not None and (check_state := getattr(problem, "check_state", None)) is not None:
-            check_state("x0", state)
+        if x0 is not None:
+            check_state(problem, "x0", state)
         shape = (problem.horizon, problem.n_controls)
         if u_init is None:
             return state, np.clip(0.0, lower, upper)

@@ -42,6 +42,7 @@ from experts.problems.shooting_problem import (
     ShootingProblem,
     check_array,
     check_at_least,
+    check_state,
     check_whole,
 )
 from experts.problems.window_problem import WindowProblem
@@ -219,6 +220,7 @@ class GuidedDDP:
         self.problem.parameters.set(given)
         start = real_array("x0", self.problem.initial_state if x0 is None else x0, np.float64)
         check_array("x0", start, (self.problem.n_states,))
+        check_state(self.problem, "x0", start)
         attempts: list[Attempt] = []
         long_steps: tuple[dict[str, Any], ...] = ()
         for guess in self._guesses(start, callback):

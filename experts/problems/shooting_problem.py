@@ -307,6 +307,13 @@ def check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name}[{position}] is {array[tuple(wrong[0])]}; every entry must be finite")
 
 
+def check_state(problem: ShootingProblem, name: str, state: FloatArray) -> None:
+    """Refuse a state, (n_x,), that is none: rotations without unit quaternions, where the problem has any."""
+    check: Callable[[str, FloatArray], None] | None = getattr(problem, "check_state", None)
+    if check is not None:
+        check(name, state)
+
+
 def check_at_least(name: str, value: float, smallest: float) -> None:
     """Refuse a setting that is no number, too small, infinite or NaN."""
     if not (_is_number(value) and smallest <= value < np.inf):

@@ -288,6 +288,12 @@ def test_a_library_of_another_problem_is_refused(unicycle, changes, message):
 # Scenes ----------------------------------------------------------------------------------------------------
 
 
+def test_a_start_that_is_no_state_is_refused():
+    solver = GuidedDDP("planar")
+    with pytest.raises(ValueError, match="x0 is no state: its rotations have the lengths 0"):
+        solver.solve(np.zeros(solver.problem.n_states))
+
+
 @pytest.fixture(scope="module")
 def paper():
     solver = GuidedDDP("paper")
