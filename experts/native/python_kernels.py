@@ -59,7 +59,11 @@ class PythonKernel:
         results = self._results(begin, end, table)
         for k in range(end - begin):
             values = self._function(*(rows[k] for rows in given))
-            for rows, value in zip(results, values, strict=True):
+            for rows, shape, value in zip(results, self._outputs, values, strict=True):
+                if np.shape(value) != shape:  # it would be spread over the whole array
+                    raise ValueError(
+                        f"a function returns an array of shape {np.shape(value)}; expected {shape}"
+                    )
                 rows[k] = value
 
     def _results(self, begin: int, end: int, table: int) -> list[NDArray[np.float64]]:

@@ -17,11 +17,12 @@ from experts.problems.shooting_problem import FloatArray, Kernel
 class PythonProblem(EuclideanProblem):
     """A `ShootingProblem` of functions: minimize sum_k stage_cost(x_k, u_k) + terminal_cost(x_N).
 
-    The solver calls the functions stage by stage, at the speed of Python; an exception in one of them ends
-    the solve. What is not given is computed by central differences, also beyond the bounds: first derivatives
-    with steps of 6e-6, relative to entries above 1, and errors of some 1e-10 of the function's size, Hessians
-    of the costs with steps of 1e-4 and errors of some 1e-7 of the cost. Second derivatives of the step are
-    never computed so: without `lagrangian_hessian` the solver uses Gauss-Newton's model.
+    The solver calls the functions stage by stage, at the speed of Python; an exception in one of them, or a
+    result of another shape, ends the solve. What is not given is computed by central differences, also beyond
+    the bounds: first derivatives with steps of 6e-6, relative to entries above 1, and errors of some 1e-10 of
+    the function's size, Hessians of the costs with steps of 1e-4 and errors of some 1e-7 of the cost. Second
+    derivatives of the step are never computed so: without `lagrangian_hessian` the solver uses Gauss-Newton's
+    model.
     """
 
     has_mixed_cost = True

@@ -194,6 +194,20 @@ def test_exceptions_reach_the_user(name, threads):
     assert after.cost == BoxDDP(pendulum(horizon=300), max_iterations=1).solve().cost
 
 
+def test_a_result_of_another_shape_in_mid_solve_is_not_spread_over_the_state():
+    problem = PythonProblem(
+        lambda x, u: x + u if x[0] == 1.0 else x[0] + u[0],
+        lambda x, u: u @ u,
+        lambda x: x @ x,
+        initial_state=[1.0, 2.0],
+        n_controls=2,
+        horizon=3,
+        linearize=lambda x, u: (np.eye(2), np.eye(2)),
+    )
+    with pytest.raises(ValueError, match=r"returns an array of shape \(\); expected \(2,\)"):
+        BoxDDP(problem).solve(u_init=np.ones((3, 2)))
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize("delay", [0.03, 0.1, 0.17])
 def test_an_interrupt_ends_the_solve_with_its_best_trajectory(delay):
