@@ -147,6 +147,7 @@ class RecedingHorizonExpert:
                 n_p), entries as in `kernels.parameters`; None for nominal ones.
 
         Raises:
+            TypeError: If one is not of real numbers.
             ValueError: If one has another shape, the parameters are not finite or the other is no state; the
                 episode goes on then.
             RuntimeError: If the maneuver cannot be simulated from there.
@@ -177,6 +178,7 @@ class RecedingHorizonExpert:
                 predicted now.
 
         Raises:
+            TypeError: If they are not of real numbers.
             ValueError: If they have another shape or are not finite.
         """
         self.maneuver.parameters.set(parameters)

@@ -20,6 +20,7 @@ from experts.problems.shooting_problem import (
     Kernel,
     StageParameters,
     check_array,
+    check_duration,
     check_problem,
     check_whole,
 )
@@ -37,7 +38,11 @@ def runge_kutta(dynamics: Function, time_step: float) -> Function:
 
     Returns:
         Function of the same arguments that returns the state after the step.
+
+    Raises:
+        ValueError: If the duration is no positive, finite number.
     """
+    check_duration("time_step", time_step)
     h = float(time_step)
 
     def step(x: Any, u: Any, *p: Any) -> Any:

@@ -256,14 +256,14 @@ def check_problem(problem: ShootingProblem) -> None:
     for name in ("n_states", "n_tangent", "n_controls", "horizon"):
         if getattr(problem, name) < 1:
             raise ValueError(f"{name} is {getattr(problem, name)}; a problem needs at least 1")
-    if not (_is_number(problem.time_step) and 0.0 < problem.time_step < np.inf):
-        raise ValueError(
-            f"time_step is {shortened(problem.time_step)}; it must be a positive number of seconds"
-        )
+    check_duration("time_step", problem.time_step)
     for name in ("control_lower", "control_upper"):
         bound = np.asarray(getattr(problem, name))
         if bound.shape not in ((problem.n_controls,), (problem.horizon, problem.n_controls)):
-            raise ValueError(f"{name} has shape {bound.shape}; expected ({problem.n_controls},)")
+            raise ValueError(
+                f"{name} has shape {bound.shape}; expected ({problem.n_controls},), or "
+                f"({problem.horizon}, {problem.n_controls}) with a row for each stage"
+            )
     lower, upper = stage_bounds(problem)
     closed = np.argwhere((lower == np.inf) | (upper == -np.inf))
     if len(closed):
@@ -318,6 +318,12 @@ def check_at_least(name: str, value: float, smallest: float) -> None:
     """Refuse a setting that is no number, too small, infinite or NaN."""
     if not (_is_number(value) and smallest <= value < np.inf):
         raise ValueError(f"{name} is {shortened(value)}; it must be a finite number, at least {smallest}")
+
+
+def check_duration(name: str, seconds: float) -> None:
+    """Refuse a duration that is no positive, finite number."""
+    if not (_is_number(seconds) and 0.0 < seconds < np.inf):
+        raise ValueError(f"{name} is {shortened(seconds)}; it must be a positive number of seconds")
 
 
 def _is_number(value: object) -> bool:

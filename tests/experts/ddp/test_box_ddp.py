@@ -439,7 +439,7 @@ def test_wrong_setting_is_refused(pendulum, settings, message):
         ({"horizon": 0}, "horizon is 0"),
         ({"time_step": -0.1}, "time_step is -0.1"),
         ({"time_step": "fast"}, "time_step is 'fast'"),
-        ({"control_lower": np.zeros(2)}, r"control_lower has shape \(2,\); expected \(1,\)"),
+        ({"control_lower": np.zeros(2)}, r"control_lower has shape \(2,\); expected \(1,\), or \(120, 1\)"),
         ({"control_lower": np.array([6.0])}, r"input 0 has bounds \[6\.0, 5\.0\]"),
         ({"control_upper": np.array([np.nan])}, r"input 0 has bounds \[-5\.0, nan\]"),
         ({"control_lower": np.array([np.inf]), "control_upper": np.array([np.inf])}, "no finite number"),

@@ -249,6 +249,12 @@ def test_contradictions_are_refused(changes, error, sentence):
         small(**changes)
 
 
+@pytest.mark.parametrize("duration", [0.0, -0.1, np.nan, np.inf, "0.1"])
+def test_a_step_of_no_duration_is_refused(duration):
+    with pytest.raises(ValueError, match=r"time_step is .*; it must be a positive number of seconds"):
+        runge_kutta(lambda x, u: x, duration)
+
+
 def test_a_control_without_a_weight_is_refused():
     problem = small(stage_cost=lambda x, u, p: u[0] ** 2)
     with pytest.raises(ValueError, match="with respect to input 1 at stage 0"):
