@@ -149,8 +149,24 @@ class BoxDDP:
         self.problem.parameters.set(parameters)
         initial_state, controls = self._check_start(x0, u_init)
         self._begin_multipliers(multipliers)
-        work, stop = self._work, None
         state = SolverState(Regularization(self.initial_regularization))
+        if multipliers is not None:
+            state.switch.request_exact()
+        try:
+            return self._solve_from(state, initial_state, controls, x_init, callback)
+        finally:  # other solvers of the problem, and rollouts, would count what an error left behind
+            self._begin_multipliers(None)
+
+    def _solve_from(
+        self,
+        state: SolverState,
+        initial_state: FloatArray,
+        controls: FloatArray,
+        x_init: FloatArray | None,
+        callback: Callback | None,
+    ) -> Solution:
+        """Iterate from a checked guess."""
+        work, stop = self._work, None
         if x_init is None:
             work.start(initial_state, controls)
         else:
@@ -159,12 +175,9 @@ class BoxDDP:
             stop = shooting.close_gaps(guess, state, self.max_iterations, callback)
         state.first_cost = work.current.cost
         if work.current.failing_stage != FINISHED:
-            self._begin_multipliers(None)
             message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
             return self._solution(state, Stop(StopReason.DIVERGED, message), np.zeros_like(work.update.K))
         state.moved = True
-        if multipliers is not None:
-            state.switch.request_exact()
         try:
             while stop is None:
                 stop = self._iterate(state, callback)

@@ -163,6 +163,18 @@ def test_penalties_leave_no_trace(solved):
 
 
 @pytest.mark.sampled
+def test_an_error_in_a_callback_leaves_no_penalties_either():
+    problem = ArmProblem("joint-limits")
+
+    def fail(record):
+        assert problem.parameters.more.any()
+        raise RuntimeError("no more")
+
+    with pytest.raises(RuntimeError, match="no more"):
+        BoxDDP(problem).solve(callback=fail, multipliers=np.ones_like(problem.constraints.multipliers))
+    assert not problem.parameters.more.any()
+
+
 def test_the_optimality_of_an_earlier_trajectory_is_not_told(solved, free):
     """Steps that were judged go on where constraints ask for more."""
     problem, solution, _ = solved
