@@ -132,14 +132,16 @@ class Folder:
         Raises DemonstrationsError if one of another part is damaged; those of this part have been checked.
         """
         paths = sorted(path for path in (self.path / SHARDS).iterdir() if SHARD_NAME.fullmatch(path.name))
-        shards = {int(path.name.partition("-")[0]): path for path in paths}
-        if len(shards) < self.settings.n_shards:
+        known = {int(path.name.partition("-")[0]): path for path in paths}
+        wanted = range(self.settings.n_shards)
+        shards = {number: known[number] for number in wanted if number in known}  # and none of other sets
+        if len(shards) < len(wanted):
             return False
         for number, path in shards.items():
             if number not in self.shards and sha256_of(path) != path.stem.partition("-")[2]:
                 part = f"{number % self.part.of + 1} of {self.part.of}"
                 raise DemonstrationsError(f"{path} is damaged: run part {part} again, which makes it anew")
-        manifest = manifest_of(self.path / SETTINGS, [shards[i] for i in range(self.settings.n_shards)])
+        manifest = manifest_of(self.path / SETTINGS, list(shards.values()))
         write_atomically(self.path / MANIFEST, manifest_text(manifest), durable=True)
         return True
 

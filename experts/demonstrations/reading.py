@@ -381,7 +381,9 @@ class Demonstrations(Sequence[Demonstration]):
             ValueError: If the shapes do not fit.
         """
         first, second = np.broadcast_arrays(np.asarray(reference), np.asarray(states))
-        n_x = first.shape[-1]
+        n_x = first.shape[-1] if first.ndim else 0
+        if n_x != self.kernels.n_x:
+            raise ValueError(f"states have shape {first.shape}; expected (..., {self.kernels.n_x})")
         rows = self.kernels.difference(first.reshape(-1, n_x), second.reshape(-1, n_x))
         return np.asarray(rows.reshape(*first.shape[:-1], -1))
 

@@ -142,6 +142,9 @@ def test_tangent_coordinates_are_those_of_the_kernels(whole: Demonstrations):
     one = whole.tangent(demonstration.states[3], demonstration.states[:6])
     assert one.shape == (6, kernels.n_t)
     np.testing.assert_allclose(one[3], 0.0, rtol=0, atol=1e-12)
+    for states in (0.0, demonstration.states[:, :5]):
+        with pytest.raises(ValueError, match=rf"states have shape .*; expected \(\.\.\., {kernels.n_x}\)"):
+            whole.tangent(states, states)
 
 
 def test_a_folder_that_is_none_is_refused(tmp_path: Path):

@@ -111,6 +111,20 @@ def test_nothing_is_complete_with_a_damaged_shard_of_another_part(quick_scene: S
         assert second.complete()
 
 
+def test_a_file_beyond_the_last_shard_neither_counts_nor_stops_the_run(
+    quick_scene: Scene, tmp_path: Path
+) -> None:
+    folder = folder_of(quick_scene, tmp_path)
+    with folder.opened():
+        (tmp_path / "shards" / f"000003-{'0' * 64}.safetensors").write_bytes(b"of another set")
+        for number in (0, 2):
+            folder.write(shard(number))
+        assert not folder.complete()
+        folder.write(shard(1))
+        assert folder.complete()
+    assert len(json.loads((tmp_path / "manifest.json").read_text())["shards"]) == 3
+
+
 def test_a_second_run_waits_for_its_turn(quick_scene: Scene, tmp_path: Path) -> None:
     folder = folder_of(quick_scene, tmp_path)
     again, part = folder_of(quick_scene, tmp_path), folder_of(quick_scene, tmp_path, Part(1, 2))
