@@ -19,7 +19,7 @@ class SolveProgress:
     def __init__(self, console: Console, scene: Scene) -> None:
         self._minimized = "J + penalties" if scene.constraints else "J"
         self._display, self._started = ProgressDisplay(console, bar=False), perf_counter()
-        self._every = 1 if console.is_terminal else LINES_EVERY
+        self._every, self._attempts = 1 if console.is_terminal else LINES_EVERY, 0
 
     def __enter__(self) -> Self:
         self._display.__enter__()
@@ -32,16 +32,21 @@ class SolveProgress:
         self._display.__exit__(kind, error, traceback)
 
     def start(self) -> None:
-        """Start the clock of the solve."""
-        self._started = perf_counter()
+        """Start the clock of the solve, and count its attempts."""
+        self._started, self._attempts = perf_counter(), 0
 
     def update(self, record: IterationRecord) -> None:
-        """Show an iteration; without a terminal, every tenth."""
+        """Show an iteration; without a terminal, every tenth.
+
+        An attempt has one guess, and one length of steps.
+        """
+        self._attempts += record.iteration == 1
         if self._every > 1 and record.iteration % self._every != 1:
             return
         step = f"step {record.alpha:<6.3g}" if record.alpha > 0.0 else "no step    "
         self._display.show(
-            f"iteration {record.iteration:3d}   {self._minimized} {record.cost:<10.8g}   {step}   "
-            f"damping {record.regularization:<7.2g}   {perf_counter() - self._started:5.2f} s",
+            f"attempt {self._attempts:2d}   iteration {record.iteration:3d}   "
+            f"{self._minimized} {record.cost:<10.8g}   {step}   damping {record.regularization:<7.2g}   "
+            f"{perf_counter() - self._started:5.2f} s",
             now=True,
         )
