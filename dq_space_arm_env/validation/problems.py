@@ -5,7 +5,7 @@ checks of several fields call `raise_problems(...)`.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, NamedTuple, NoReturn, Self
+from typing import Any, ClassVar, NamedTuple, NoReturn, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
@@ -92,7 +92,7 @@ def _rethrow(model: type[Model], error: ValidationError) -> NoReturn:
     """Raise the same errors, worded as "path = value: what would be right"."""
     explained = []
     for detail in error.errors(include_url=False):
-        location = detail["loc"]
+        location = _without_tag(model, detail["loc"])
         if detail["type"] == _KIND:
             sentence = detail["ctx"]["sentence"]
             # A nested model has already said what the field means; a check of our own has not yet.
@@ -108,6 +108,16 @@ def _rethrow(model: type[Model], error: ValidationError) -> NoReturn:
         kind = PydanticCustomError(_KIND, "{path}{value}: {sentence}", context)
         explained.append(InitErrorDetails(type=kind, loc=location, input=detail["input"]))
     raise ValidationError.from_exception_data(model.__name__, explained) from None
+
+
+def _without_tag(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[int | str, ...]:
+    """A location without the tag that pydantic puts behind a union's field: it is no key of the file."""
+    field = model.model_fields.get(str(location[0])) if len(location) > 1 else None
+    if field is None or not isinstance(field.discriminator, str):
+        return location
+    named = [option.model_fields[field.discriminator] for option in get_args(field.annotation)]
+    tags = {tag for each in named for tag in get_args(each.annotation)}
+    return (location[0], *location[2:]) if location[1] in tags else location
 
 
 def _shown(value: object) -> str:

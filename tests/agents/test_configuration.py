@@ -81,7 +81,10 @@ def test_unknown_keys_are_refused_with_a_suggestion():
     ("changes", "sentence"),
     [
         ({"algorithm": {"name": "DQN"}}, "it must be one of PPO, SAC, TQC, TD3, APG, cloning, dagger, act"),
-        ({"algorithm": {"name": "PPO", "gamma": 1.5}}, "gamma = 1.5: must be a number from 0 to 1"),
+        (
+            {"algorithm": {"name": "PPO", "gamma": 1.5}},
+            "- algorithm.gamma = 1.5: must be a number from 0 to 1",
+        ),
         ({"algorithm": {"name": "SAC", "ent_coef": "autoo"}}, ".ent_coef = 'autoo': must be a finite"),
         ({"algorithm": {"name": "TQC", "ent_coef": 0.0}}, "must be a finite number greater than 0, or auto"),
         ({"algorithm": {"name": "SAC", "target_entropy": "x"}}, "must be a finite number, or auto ("),
@@ -165,7 +168,7 @@ def test_the_algorithm_decides_about_the_class():
         ({"algorithm": {"name": "dagger", "share": 1.0}}, "share = 1.0: must be less than 1"),
         (
             {"algorithm": {"name": "dagger", "optimization": {"batch_size": 1}}},
-            "algorithm.dagger.optimization.batch_size = 1: must be at least 2: a labeled state",
+            "algorithm.optimization.batch_size = 1: must be at least 2: a labeled state",
         ),
         ({"algorithm": {"name": "act", "width": 50}}, "heads = 4: must divide width, 50"),
         ({"algorithm": {"name": "act", "chunk": 1002, "spacing": 10}}, "1002 actions are 10,011 time steps"),
