@@ -38,7 +38,7 @@ _SUITE, _TASK = Named("suite", _suites), Named("task", _tasks)
     short_help="Fly any controller in all tasks of the benchmark suite.",
     epilog="""\b
         Examples:
-          dq-space-arm suite                                    # all that ships, in hours
+          dq-space-arm suite                                    # all that ships, in 1.5 hours
           dq-space-arm suite gains 'mine=runs/{task}.npz'       # your policies, one for each task
           dq-space-arm suite my.yaml --seeds 3 --task paper     # your configuration, trained for a task
           dq-space-arm suite 'mine=runs/{task}.npz' --check mine.json  # whether a published result is right

@@ -199,7 +199,6 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
        the task, not a truncation.
     2. Termination: the simulation diverged (the state is not finite, or its norm exceeds 5e5). `info["diverged"]` is true, and this and the remaining steps are
        charged with a bound of what any motion from there could cost, so ending early never pays.
-
     3. Termination: a constraint with `terminates: true` is violated by more than its tolerance. The episode is no success, and is charged as after a divergence.
 
     A step is divided where it would err by more than the scene's `simulation.tolerance` (1e-3 rad or m by default): motions too fast for the time step stay
