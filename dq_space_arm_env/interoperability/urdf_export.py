@@ -30,10 +30,10 @@ def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     (Pinocchio: `JointModelFreeFlyer`). Each further link has the frame of its joint and carries the scene's
     name; its joint turns about z, or slides along it, and is called by the link's name and " joint". A link
     `tip` without mass, or with that of the payload, has the frame G; so have other tips, by their names.
-    Torque limits become efforts, 0 for a joint without motor. The scene's joint limits, without their
-    margins, make a joint revolute, others are continuous; 1e4 rad (m), rad/s (m/s) and N m (N) stand for none
-    where URDF asks for a number. It has no thrusters, wheels, start, task or other constraints. Shapes become
-    visuals.
+    Torque limits become efforts, 0 for a joint without motor, viscous damping and Coulomb friction its
+    `dynamics`, which has no smoothing speed. The scene's joint limits, without their margins, make a joint
+    revolute, others are continuous; 1e4 rad (m), rad/s (m/s) and N m (N) stand for none where URDF asks for a
+    number. It has no thrusters, wheels, start, task or other constraints. Shapes become visuals.
 
     Features that URDF lacks and that change the motion are refused: joint springs, rotors, screw and
     spherical joints, a wrench at the tip, a planar base, reaction wheels, a tank, phases that change the
