@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from agents.configuration import list_configurations
 from agents.evaluation.plan_followers import CONTROLLERS
@@ -63,6 +64,30 @@ def sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[s
                 raise SuiteError(_ONE_NAME.format(name))
             files[name] = path
     return controllers, agents, files
+
+
+def find_fliers(
+    files: Mapping[str, str],
+    policies: Mapping[str, Callable[[Scene], Any]],
+    scenes: Mapping[str, Scene],
+    trust: bool,
+) -> dict[str, list[tuple[str, Any]]]:
+    """Policies by name that fly in each task: those of files, and those that functions make for its scene.
+
+    Raises SuiteError if a file fits no task.
+    """
+    fliers: dict[str, list[tuple[str, Any]]] = {}
+    for task, scene in scenes.items():
+        made = [(name, as_policy(make(scene), name)) for name, make in policies.items()]
+        for _, acting in made:
+            check_fit(acting, scene)
+        fliers[task] = [*from_files(files, task, scene, trust), *made]
+    fitting = {name for found in fliers.values() for name, _ in found}
+    for name, path in files.items():
+        if name not in fitting and name != ZOO:
+            why = "there is no such file" if TASK in path else "fits no task"
+            raise SuiteError(f"{path}: {why}, whichever the task")
+    return fliers
 
 
 def from_files(

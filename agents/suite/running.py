@@ -17,17 +17,15 @@ from agents.experiments.many_trainings import train_seeds, training_executor, tr
 from agents.experiments.training_task import FAILED
 from agents.run_folder import POLICY
 from agents.suite.entrants import (
-    TASK,
     agent_name,
     check_names,
-    from_files,
+    find_fliers,
     missing_files,
     names_of,
     sorted_out,
 )
 from agents.suite.scores import Score, SuiteRun
 from agents.suite.tasks import ZOO, Suite, SuiteError, load_suite
-from agents.zoo.finding import as_policy, check_fit
 from dq_space_arm_env import Scene
 from dq_space_arm_env.common.progress import Advance
 from experts.executors import Executor, local_executor
@@ -90,18 +88,8 @@ def run_suite(
         entrants = (*CONTROLLERS, *chosen.agents, ZOO)
     controllers, agents, files = sorted_out(entrants, chosen)
     check_names([*names_of(controllers, agents, files), *policies])
-    fliers = {task: [*from_files(files, task, scene, trust)] for task, scene in scenes.items()}
-    for task, scene in scenes.items():
-        made = [(name, as_policy(make(scene), name)) for name, make in policies.items()]
-        for _, acting in made:
-            check_fit(acting, scene)  # before anything is trained
-        fliers[task] += made
-    fitting = {name for found in fliers.values() for name, _ in found}
-    for name, path in files.items():
-        if name not in fitting and name != ZOO:
-            why = "there is no such file" if TASK in path else "fits no task"
-            raise SuiteError(f"{path}: {why}, whichever the task")
-    if not (controllers or agents or fitting):
+    fliers = find_fliers(files, policies, scenes, trust)  # before anything is trained
+    if not (controllers or agents or any(fliers.values())):
         raise SuiteError(f"{ZOO}: no policy that ships was trained in {', '.join(scenes)}: nobody can fly")
     plans = {(agent, task): chosen.training(agent, task) for agent in agents for task in scenes}
     notes = [*missing_files(files, scenes)]

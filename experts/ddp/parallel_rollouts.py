@@ -134,7 +134,7 @@ def _roll_out(
     control_upper: FloatArray,
     work: _Work,
 ) -> None:
-    """Roll out all lanes; NaN stays in its lane."""
+    """Roll out all lanes as `closed_loop_rollout` does one, without a retraction; NaN stays in its lane."""
     horizon, n_x = work.controls.shape[0], work.states.shape[2]
     first_states = kernels.difference_buffers[1]
     for lane in range(LANES):

@@ -30,6 +30,17 @@ lxx, luu and lux may be convex approximations: Gauss-Newton's. `lagrangian_hessi
 Lxx, Lux and Luu are those of the stage cost + multiplier . (step(x (+) z, u) (-) step(x, u)) with respect to
 tangent state z and control u. `retract`, the inverse of `difference`, removes rounding errors from a pose; it
 serves guesses of the states, and only problems with `has_retraction` need it.
+
+A problem may have these attributes besides those of `ShootingProblem`:
+
+| attribute | without it |
+|---|---|
+| `constraints`, a `StageConstraints` or None; kernels read `parameters.more` | nothing constrains it |
+| `rate_limits`, see `RateLimits` | controls may jump |
+| `is_success(states, controls)`, whether a trajectory fulfills its task | whatever converges does |
+| `check_state(name, x)`, which raises ValueError for numbers that are no state | all are states |
+| `native_calls()`, see `native_calls` | kernels raise nothing |
+| `compiling_aside(kernels, before)`, see `compiling_aside` | kernels compile when they are asked for |
 """
 
 from collections.abc import Callable, Iterator, Sequence
