@@ -128,13 +128,21 @@ def policies_verb(
         )
     executor = chosen_executor(workers, ray)
     from agents.evaluation.evaluation_verbs import evaluate_policies
+    from agents.evaluation.plan_followers import CONTROLLERS
     from dq_space_arm_env.common.console import table_console as wide_console
 
     if out is not None:
         check_writable(out)
     chosen = given(n=n, conditions=conditions)
+    named = (*policies, *more)
+    for name in named:
+        if name in CONTROLLERS and not Path(name).exists():
+            raise click.UsageError(
+                f"{name}: is a controller of the expert: `dq-space-arm compare --controller {name}` flies it",
+                click.get_current_context(),
+            )
     with keeping("the expert's solutions are kept; run the same command to resume"):
-        console, named = wide_console(150, stderr=as_json), (*policies, *more)
+        console = wide_console(150, stderr=as_json)
         summaries = evaluate_policies(
             console,
             named,

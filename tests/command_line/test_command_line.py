@@ -146,6 +146,7 @@ def test_every_verb_helps_with_examples_that_it_understands(path: tuple[str, ...
         (["replay", "a.npz", "--label", "one", "--label", "two"], "2 labels for 1 flights"),
         (["train"], "give a configuration: a YAML file, or one of act, apg, apg-from-clone, apg-robust,"),
         (["evaluate"], "name a policy to evaluate"),
+        (["evaluate", "gains"], "`dq-space-arm compare --controller gains` flies it"),
         (["evaluate", "a.npz", "--condition", "training", "spinn"], "did you mean 'spin'?"),
         (["evaluate", "show", "nobody"], "the zoo has no policy 'nobody'"),
         (["compare", "--controller", "gain"], "'gain' is unknown; did you mean 'gains'?"),
