@@ -111,6 +111,12 @@ def test_suites_in_the_documentation_have_scenes_as_they_are():
     assert [suite.scene(task).name for task in suite.tasks] == list(suite.tasks)
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_no_line_of_a_page_is_a_comment(page):
+    """MyST drops a line that begins with %, as a wrapped one may."""
+    assert not re.findall(r"^ *%.*", TEXTS[page], flags=re.MULTILINE)
+
+
 def test_table_of_scenes_is_right():
     row = r"^\| `([\w-]+)` \|[^|]*\| (\d+), (\d+) \| (\d+) \|$"
     rows = re.findall(row, TEXTS["scene"], flags=re.MULTILINE)
