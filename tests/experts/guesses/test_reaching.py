@@ -161,5 +161,5 @@ def test_updates_without_progress_end_as_infeasible():
 def test_a_reserve_is_a_share_of_the_tolerances(paper, start):
     solution = replace(GuidedDDP("paper", library=paper.library, reserve=0.1).solve(start), problem=None)
     assert paper.problem.misses(solution.states[-1]) == pytest.approx(0.89, abs=0.01)
-    with pytest.raises(ValueError, match=r"reserve is 0\.5; it must be at least 0 and less than"):
+    with pytest.raises(ValueError, match=r"reserve is 0\.5; it must be less than 0\.5"):
         GuidedDDP("paper", reserve=0.5)
