@@ -182,6 +182,12 @@ class Scene(Model):
         if tree := [*self._tree_problems()]:
             yield from tree
             return  # others look along the arms
+        own = [*self._problems_without_phases()]
+        yield from own
+        if self.phases:
+            yield from phase_problems(self, sound=not own)
+
+    def _problems_without_phases(self) -> Iterator[Problem]:
         yield from self._actuator_problems()
         yield from self._part_problems()
         yield from self._integrator_problems()
@@ -191,8 +197,6 @@ class Scene(Model):
         yield from tank_problems(self)
         yield from self._cost_problems()
         yield from self._parameter_problems()
-        if self.phases:
-            yield from phase_problems(self)
         found = [*constraint_problems(self)]
         yield from found or self._previous_control_problems()
         if self.base.motion == "planar":

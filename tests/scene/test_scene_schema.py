@@ -310,3 +310,17 @@ def test_no_other_tip_hides_a_frame(name: str) -> None:
     tips = [tip.model_dump() | {"name": name} for tip in scene.other_tips]
     with pytest.raises(SceneError, match=rf"other_tips\[0\]\.name = '{name}': is a frame of every scene"):
         scene.replace(other_tips=tips)
+
+
+def test_mistakes_beside_phases_keep_their_place() -> None:
+    phases = [{"name": "only", "steps": 900, "changes": {"base.mass": 90.0}}]
+    scene = load_scene("wheels").model_dump() | {"phases": phases}
+    scene["initial_state"]["wheel_speeds"] = [9000.0, 0.0, 0.0, 0.0]
+    scene["constraints"] = [{"name": "reserve", "kind": "propellant"}]
+    with pytest.raises(SceneError) as caught:
+        load_scene(scene)
+    said = str(caught.value)
+    assert "changed" not in said
+    assert "\n  - initial_state.wheel_speeds = " in said
+    assert "\n  - constraints[0].kind = 'propellant': the scene has no actuators.tank" in said
+    assert "\n  - phases = 900: have 900 steps together" in said
