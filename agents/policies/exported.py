@@ -291,7 +291,10 @@ class ExportedPolicy:
                 "give a policy of single actions, such as cloning-with-gains"
             )
         if found is None:
-            raise PolicyFileError(f"{path} holds no policy but {', '.join(arrays)[:_LONGEST] or 'nothing'}")
+            what = ", ".join(arrays)[:_LONGEST] or "nothing"
+            if {"states", "controls", "feedback_gains"} <= set(arrays):
+                what = "the solution from one start, which `dq-space-arm simulate SCENE --policy` flies"
+            raise PolicyFileError(f"{path} holds no policy but {what}")
         check_version(path, "format", found)
         with building(path):
             return cls(**_fields(arrays))

@@ -4,6 +4,7 @@ import io
 import pickle
 import zipfile
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -217,3 +218,10 @@ def test_it_runs_without_pytorch(run_without, tmp_path):
     policy.save(tmp_path / "policy.npz")
     run = run_without(("stable_baselines3", "torch"), WITHOUT_TORCH, tmp_path / "policy.npz")
     assert run.stdout.strip() == str(policy(np.zeros(N_OBS)).tolist())
+
+
+def test_a_solution_is_told_from_a_policy(tmp_path: Path) -> None:
+    file = tmp_path / "solution.npz"
+    np.savez(file, states=np.zeros((2, 3)), controls=np.zeros((1, 2)), feedback_gains=np.zeros((1, 2, 3)))
+    with pytest.raises(PolicyFileError, match="the solution from one start, which `dq-space-arm simulate"):
+        ExportedPolicy.load(file)
