@@ -246,7 +246,9 @@ def _change_problems(
     """Find changes that phases cannot make."""
     for path, value in phase.changes:
         if value is None and path not in _REMOVABLE and path.removeprefix(_ACTUATORS) not in _FIELDS:
-            yield Problem((*here, path), value, "only payload, actuators or target.motion may be null")
+            sentence = "only payload, actuators or target.motion may be null"
+            removable = [*_REMOVABLE, *(_ACTUATORS + field for field in _FIELDS)]
+            yield Problem((*here, path), value, did_you_mean(path, removable, sentence))
         elif path == "payload" and scene.payload is None:
             yield Problem((*here, path), value, "the scene has no payload")
         elif value is None and path.startswith(_ACTUATORS) and _value_at(scene, path) is None:
@@ -262,6 +264,13 @@ def _why_not(scene: Scene, path: str, names: set[str]) -> str:
     such = "such are base.mass, links.0.mass, cost.pose, target.pose"
     present = _value_at(scene, path)
     if present is None:
+        first, _, rest = path.partition(".")
+        positions = {link.name: str(index) for index, link in enumerate(scene.links)}
+        name = next((name for name in positions if rest.startswith(f"{name}.")), None)
+        if first == "links" and name is not None:
+            meant = f"links.{positions[name]}{rest.removeprefix(name)}"
+            if meant in names:
+                return f"links go by their positions, from 0: did you mean {meant!r}?"
         paths = {part for name in names for part in parents(name) if _may_change(part, names)}
         known = sorted(part for part in paths if _value_at(scene, part) is not None)
         return f"leads to no number that phases change; {did_you_mean(path, known, such)}"

@@ -324,3 +324,16 @@ def test_mistakes_beside_phases_keep_their_place() -> None:
     assert "\n  - initial_state.wheel_speeds = " in said
     assert "\n  - constraints[0].kind = 'propellant': the scene has no actuators.tank" in said
     assert "\n  - phases = 900: have 900 steps together" in said
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"target.motoin": None}, "did you mean 'target.motion'? Only payload, actuators or target.motion"),
+        ({"links.link 2.mass": 3.0}, "links go by their positions, from 0: did you mean 'links.1.mass'?"),
+    ],
+)
+def test_changes_of_a_phase_suggest_what_was_meant(changes: dict[str, object], said: str) -> None:
+    phases = [{"name": "only", "steps": 1000, "changes": changes}]
+    with pytest.raises(SceneError, match=re.escape(said)):
+        load_scene("tracking").replace(phases=phases)
