@@ -15,6 +15,7 @@ from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
 from dq_space_arm_env.scene import Link, Scene, StateLayout
 from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraint_rows import path_rows
+from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.parameters import parameters
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.task.constraint_residuals import state_residuals
@@ -30,6 +31,7 @@ _LIGHT = 0.005  # kg
 _GYRATION = 3.0  # radius of gyration of a base relative to the reach of the arm, or 1 m
 _DENSE = 1e5  # kg/m^3, of the cube with a body's mass and inertia: five times tungsten
 _STEP = 1.0  # s
+_SPIN = 1.0  # rad/s, of a target: a turn in six seconds
 _NEAR = 2.0  # times a tolerance, of a way to the target
 _ROUNDED = 9  # digits after the point of a distance, m
 _SPEEDS = 0.5, 45.0  # m/s and degrees/s, on the mean way to the target
@@ -58,6 +60,12 @@ def _units(scene: Scene) -> Iterator[str]:
             if turns and abs(value) > most:
                 yield f"initial_state.{name}: {value:g} {unit}: degrees?"
                 break
+    yield from _together(
+        (f"constraints: limits of {link.name!r}", f"{bound:g} m: millimeters?")
+        for link, (lower, upper, _) in zip(scene.links, joint_limits(scene), strict=True)
+        if link.joint_type == "prismatic"
+        for bound in [bound for bound in (lower, upper) if _FAR < abs(bound) < math.inf][:1]
+    )
     degrees = []
     for link, (lower, upper, rate) in zip(scene.links, joint_limits(scene), strict=True):
         wide = [bound for bound in (lower, upper) if _ROUNDS < abs(bound) < math.inf]
@@ -159,6 +167,7 @@ def _times(scene: Scene) -> Iterator[str]:
     simulation = scene.simulation
     if simulation.dt > _STEP:
         yield f"simulation.dt: {simulation.dt:g} s: milliseconds?"
+    yield from _path(scene)
     seconds, (degrees, meters) = simulation.steps * simulation.dt, way_to_target(scene)
     drifts = any(scene.initial_state.base_velocity) or any(scene.initial_state.joint_rates)
     if not drifts and (meters / seconds > _SPEEDS[0] or degrees / seconds > _SPEEDS[1]):
@@ -172,6 +181,20 @@ def _times(scene: Scene) -> Iterator[str]:
             f"success.position_error: {tolerance:g} m, where the way to the target is {meters:.3g} m: hardly "
             "anything fails"
         )
+
+
+def _path(scene: Scene) -> Iterator[str]:
+    """Paths of targets that the episode does not see, that are elsewhere, or that spin."""
+    motion, seconds = scene.target.motion, scene.simulation.steps * scene.simulation.dt
+    if isinstance(motion, Waypoints):
+        late = [index for index, point in enumerate(motion.points) if point.time > seconds]
+        if late:
+            yield (
+                f"target.motion.points[{late[0]}].time: {motion.points[late[0]].time:g} s, after the end of "
+                f"the episode at {seconds:g} s: the target does not come there"
+            )
+    elif motion is not None and (rate := math.hypot(*motion.angular_velocity)) > _SPIN:
+        yield f"target.motion.angular_velocity: {rate:.3g} rad/s: degrees per second?"
 
 
 def way_to_target(scene: Scene) -> tuple[float, float]:

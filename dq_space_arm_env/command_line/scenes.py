@@ -119,7 +119,7 @@ def validate(files: tuple[str, ...], as_json: bool) -> int:
         if not problems:
             say(f"{file}: valid")
         if advice is not None:
-            say(f"{file}: {advice}")
+            say(f"{file}: warning: {advice}")
         for sentence in unwise:
             say(f"{file}: warning: {sentence}")
     if as_json:

@@ -152,6 +152,7 @@ def test_a_valid_scene_whose_steps_blow_up_is_told_what_to_take(
     file.write_text(scene.replace(links=links).to_yaml(), encoding="utf-8")
     assert main(["scenes", "validate", str(file)]) == SUCCESS
     printed = capsys.readouterr().out
+    assert f"{file}: warning: joints" in printed
     assert (
         "where rk4 is unstable in steps of 0.015 s: set simulation.integrator to rodas4, or dt to" in printed
     )
@@ -205,6 +206,21 @@ NEAR = {
         (
             {"constraints": [{"name": "l", "kind": "joint_limits", "rate": [1, 30, 1]}]},
             r"constraints: limits of 'link 2': 30 rad/s: degrees\?$",
+        ),
+        (
+            {"target.motion": {"kind": "waypoints", "points": [{"time": t, "pose": {}} for t in (0, 20)]}},
+            r"target.motion.points\[1\].time: 20 s, after the end of the episode at 15 s: the target",
+        ),
+        (
+            {"target.motion": {"kind": "tumbling", "inertia": [4, 5, 6], "angular_velocity": [1, 3, 2]}},
+            r"target.motion.angular_velocity: 3.74 rad/s: degrees per second\?",
+        ),
+        (
+            {
+                "links.0.joint_type": "prismatic",
+                "constraints": [{"name": "l", "kind": "joint_limits", "upper": [500, 3, 3]}],
+            },
+            r"constraints: limits of 'link 1': 500 m: millimeters\?",
         ),
         ({"simulation.dt": 15}, r"simulation.dt: 15 s: milliseconds\?"),
         ({"simulation.steps": 100}, r"simulation.steps: an episode of 1.5 s for .* m and .* degrees to the"),
