@@ -58,7 +58,10 @@ def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array], steps
             have, or goes on after.
     """
     if not isinstance(state, Mapping):
-        raise ValueError(f"state: {shortened(state)}, should be what get_state() returns")
+        raise ValueError(
+            f"state: {shortened(state)}, should be what get_state() returns; an episode begins at a state of "
+            "the scene by options={'initial_state': x}"
+        )
     found = {}
     for name, wanted in expected.items():
         if name not in state:

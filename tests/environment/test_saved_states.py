@@ -211,7 +211,7 @@ def test_bad_states_are_refused_and_change_nothing():
                 with pytest.raises(ValueError, match=f"state: {name} "):
                     each.set_state({**rest, **change})
         for bad in (3, [1, 2], "x"):
-            with pytest.raises(ValueError, match="should be what get_state"):
+            with pytest.raises(ValueError, match=r"should be what get_state.*initial_state"):
                 each.set_state(bad)
             with pytest.raises(ValueError, match="should be what get_state"):
                 each.reset(options={"state": bad})
