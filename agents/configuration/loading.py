@@ -19,6 +19,7 @@ from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.validation import (
     YAMLError,
     did_you_mean,
+    mapping_at_top,
     parse_yaml,
     problem_list,
     read_yaml,
@@ -106,13 +107,11 @@ def _read(file: Traversable) -> AgentConfiguration:
     try:
         # A package in a zip file has its configurations there.
         data = read_yaml(file) if isinstance(file, Path) else parse_yaml(file.read_text(encoding="utf-8"))
+        return _of_its_class(mapping_at_top(file, data), str(file))
     except UnreadableError as error:
         raise ConfigurationError(str(error)) from error
     except YAMLError as error:
         raise ConfigurationError(f"{file}: not valid YAML: {yaml_problem(error)}") from error
-    if not isinstance(data, dict):
-        raise ConfigurationError(f"{file}: must be a mapping (key: value) at the top")
-    return _of_its_class(data, str(file))
 
 
 def _of_its_class(data: Mapping[str, Any], origin: str) -> AgentConfiguration:

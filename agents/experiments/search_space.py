@@ -18,6 +18,7 @@ from dq_space_arm_env.validation import (
     Model,
     Problem,
     YAMLError,
+    mapping_at_top,
     problem,
     problem_list,
     read_yaml,
@@ -102,10 +103,7 @@ def load_search_space(path: str | Path, configuration: AgentConfiguration) -> Se
             another, or one of its values is not allowed there.
     """
     try:
-        data = read_yaml(path)
-        if not isinstance(data, dict):
-            raise ConfigurationError(f"{path}: must be a mapping (key: value) at the top")
-        space = SearchSpace.model_validate(data)
+        space = SearchSpace.model_validate(mapping_at_top(path, read_yaml(path)))
     except UnreadableError as error:
         raise ConfigurationError(str(error)) from error
     except YAMLError as error:

@@ -25,6 +25,7 @@ from dq_space_arm_env.validation import (
     YAMLError,
     count_up_to,
     did_you_mean,
+    mapping_at_top,
     problem_list,
     read_yaml,
     yaml_problem,
@@ -139,10 +140,7 @@ def load_suite(source: str | Path | Suite = "v1") -> Suite:
     if source not in shipped and path.suffix not in (".yaml", ".yml"):
         raise SuiteError(f"suite: {str(source)!r}, should be one of {', '.join(shipped)}, or a YAML file")
     try:
-        data = read_yaml(path)
-        if not isinstance(data, dict):
-            raise SuiteError(f"{path}: must be a mapping (key: value) at the top")
-        return Suite.model_validate(data)
+        return Suite.model_validate(mapping_at_top(path, read_yaml(path)))
     except UnreadableError as error:
         raise SuiteError(str(error)) from error
     except YAMLError as error:

@@ -184,7 +184,7 @@ def _times(scene: Scene) -> Iterator[str]:
 
 
 def _path(scene: Scene) -> Iterator[str]:
-    """Paths of targets that the episode does not see, that are elsewhere, or that spin."""
+    """Waypoints after the end of the episode, and targets that spin."""
     motion, seconds = scene.target.motion, scene.simulation.steps * scene.simulation.dt
     if isinstance(motion, Waypoints):
         late = [index for index, point in enumerate(motion.points) if point.time > seconds]

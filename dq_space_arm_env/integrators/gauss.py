@@ -347,8 +347,8 @@ class _Graphs:
             handed = given.handed_on(self.x, self.momentum, given.parts(self.start), end)
             outputs["momentum_next"] = or_nan(handed, judgement[0])
             outputs |= {"moved": moved} if self.joints else {}
-        inputs = self._whole() | {"start": self.start, "center": center, "judgement": judgement}
-        inputs |= {"total": self.total}
+        inputs = self._whole() | {"start": self.start, "total": self.total}
+        inputs |= {"center": center, "judgement": judgement}
         return self._graph("carry_out" if self.walks else "leave", inputs, outputs)
 
     def cut_off(self) -> Any:

@@ -245,9 +245,9 @@ def _change_problems(
 ) -> Iterator[Problem]:
     """Find changes that phases cannot make."""
     for path, value in phase.changes:
-        if value is None and path not in _REMOVABLE and path.removeprefix(_ACTUATORS) not in _FIELDS:
+        removable = [*_REMOVABLE, *(_ACTUATORS + field for field in _FIELDS)]
+        if value is None and path not in removable:
             sentence = "only payload, actuators or target.motion may be null"
-            removable = [*_REMOVABLE, *(_ACTUATORS + field for field in _FIELDS)]
             yield Problem((*here, path), value, did_you_mean(path, removable, sentence))
         elif path == "payload" and scene.payload is None:
             yield Problem((*here, path), value, "the scene has no payload")

@@ -20,7 +20,7 @@ from ruamel.yaml.representer import SafeRepresenter
 from ruamel.yaml.resolver import VersionedResolver
 from ruamel.yaml.scanner import Scanner, ScannerError
 
-from dq_space_arm_env.common.bounded_reading import read_text
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_text
 from dq_space_arm_env.common.shown_text import printable, shortened
 
 __all__ = ["YAMLError", "dump_yaml", "line_of", "parse_yaml", "read_yaml", "yaml_problem"]
@@ -162,6 +162,13 @@ def read_yaml(path: str | os.PathLike[str]) -> Any:
         YAMLError: As `parse_yaml`.
     """
     return parse_yaml(read_text(path, 4 * TEXT_LENGTH))  # a character takes up to 4 bytes
+
+
+def mapping_at_top(path: object, data: Any) -> dict[str, Any]:
+    """The content of a file of YAML that has keys; UnreadableError, with its path, for any other."""
+    if not isinstance(data, dict):
+        raise UnreadableError(f"{path}: must be a mapping (key: value) at the top")
+    return data
 
 
 def dump_yaml(data: dict[str, Any], header: str = _HEADER) -> str:
