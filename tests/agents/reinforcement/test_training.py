@@ -317,13 +317,15 @@ def test_an_unfinished_checkpoint_is_none(scene_file, tmp_path):
 def test_a_folder_is_for_one_configuration_and_scene_but_may_get_more_time(scene_file, tmp_path):
     path = tmp_path / "scene.yaml"
     path.write_bytes(scene_file.read_bytes())
-    for changes in ({}, {"total_steps": 6400}, {"description": "the same in other words"}):
+    for changes in ({}, {"description": "the same in other words"}, {"total_steps": 6400}):
         RunFolder(tmp_path / "run", configuration("PPO", path, **changes)).write_evaluations([])
+    with pytest.raises(RunFolderError, match="total_steps: 6400, which may become larger, not 3200"):
+        RunFolder(tmp_path / "run", configuration("PPO", path))
     with pytest.raises(RunFolderError, match="seed is 0 there and 1 here"):
         RunFolder(tmp_path / "run", configuration("PPO", path, seed=1))
     PAPER.replace(name="short", simulation={"dt": 0.01, "steps": STEPS}).to_yaml(path)
     with pytest.raises(RunFolderError, match="started with another version of scene"):
-        RunFolder(tmp_path / "run", configuration("PPO", path))
+        RunFolder(tmp_path / "run", configuration("PPO", path, total_steps=6400))
 
 
 def test_a_damaged_file_of_a_folder_is_named(scene_file, tmp_path):
