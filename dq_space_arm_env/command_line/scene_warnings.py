@@ -12,7 +12,7 @@ from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
-from dq_space_arm_env.scene import Link, Scene, StateLayout
+from dq_space_arm_env.scene import Link, Pose, Scene, StateLayout
 from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.scene.motion import Waypoints
@@ -31,6 +31,8 @@ _LIGHT = 0.005  # kg
 _GYRATION = 3.0  # radius of gyration of a base relative to the reach of the arm, or 1 m
 _DENSE = 1e5  # kg/m^3, of the cube with a body's mass and inertia: five times tungsten
 _STEP = 1.0  # s
+_FRACTIONS_OF_PI = 6.0, 4.0, 3.0, 2.0, 1.5, 1.0
+_ROUNDED_PI = 0.002  # degrees, within which an angle is such a fraction of pi
 _SPIN = 1.0  # rad/s, of a target: a turn in six seconds
 _NEAR = 2.0  # times a tolerance, of a way to the target
 _ROUNDED = 9  # digits after the point of a distance, m
@@ -45,7 +47,7 @@ def warnings_of(scene: Scene) -> list[str]:
 
 
 def _units(scene: Scene) -> Iterator[str]:
-    """Lengths that look like millimeters, angles that look like degrees."""
+    """Lengths that look like millimeters, angles that look like degrees, and degrees like radians."""
     yield from _together(
         (f"links[{i}].joint.position", f"{length:g} m from {link.name!r} to its parent: millimeters?")
         for i, link in enumerate(scene.links)
@@ -66,6 +68,11 @@ def _units(scene: Scene) -> Iterator[str]:
         if link.joint_type == "prismatic"
         for bound in [bound for bound in (lower, upper) if _FAR < abs(bound) < math.inf][:1]
     )
+    yield from _together(
+        (f"{place}.rotation", f"{angle:.5g} degrees: radians?")
+        for place, pose in _poses(scene)
+        if any(abs((angle := _angle(pose)) - math.pi / part) < _ROUNDED_PI for part in _FRACTIONS_OF_PI)
+    )
     degrees = []
     for link, (lower, upper, rate) in zip(scene.links, joint_limits(scene), strict=True):
         wide = [bound for bound in (lower, upper) if _ROUNDS < abs(bound) < math.inf]
@@ -75,6 +82,22 @@ def _units(scene: Scene) -> Iterator[str]:
     yield from (f"constraints: limits of {sentence}" for sentence in _together(degrees))
     if max(scene.spread.joint_angles, scene.spread.base_rotation, scene.spread.wrist_angles) > math.pi:
         yield "spread: draws of angles by more than half a turn, rad: degrees?"
+
+
+def _poses(scene: Scene) -> Iterator[tuple[str, Pose]]:
+    """All poses that a scene gives, with their keys."""
+    yield "initial_state.base_pose", scene.initial_state.base_pose
+    yield from ((f"links[{i}].joint", link.joint) for i, link in enumerate(scene.links))
+    yield from [("wrist.frame", scene.wrist.frame)] if scene.wrist is not None else []
+    yield "tip", scene.tip
+    yield "target.pose", scene.target.pose
+    yield "target.grasp", scene.target.grasp
+
+
+def _angle(pose: Pose) -> float:
+    """Angle of a pose's rotation, degrees."""
+    w, *xyz = pose.rotation
+    return math.degrees(2.0 * math.atan2(math.hypot(*xyz), abs(w)))
 
 
 def _masses(scene: Scene) -> Iterator[str]:
@@ -187,6 +210,11 @@ def _path(scene: Scene) -> Iterator[str]:
     """Waypoints after the end of the episode, and targets that spin."""
     motion, seconds = scene.target.motion, scene.simulation.steps * scene.simulation.dt
     if isinstance(motion, Waypoints):
+        if motion.points[0].pose != scene.target.pose:
+            yield (
+                "target.motion.points[0].pose: is not target.pose, from where the body moves as the points "
+                "do from the first: to pass through them, give target.pose the first one's"
+            )
         late = [index for index, point in enumerate(motion.points) if point.time > seconds]
         if late:
             yield (
@@ -207,8 +235,7 @@ def way_to_target(scene: Scene) -> tuple[float, float]:
     target = np.atleast_2d(shown_target(scene)[0])[0]
     way = dual_quaternion.multiply(dual_quaternion.conjugate(tip), tuple(target.tolist()))
     rotation, position = poses.to_rotation_and_position(way)
-    degrees = math.degrees(2.0 * math.atan2(math.hypot(*rotation[1:]), abs(rotation[0])))
-    return degrees, round(math.hypot(*position), _ROUNDED)
+    return _angle(Pose(rotation=rotation)), round(math.hypot(*position), _ROUNDED)
 
 
 def _reach(scene: Scene) -> Iterator[str]:

@@ -76,7 +76,7 @@ Changes = Annotated[
 class Phase(Model):
     """A part of the episode with numbers of its own."""
 
-    name: Name = Field(description="name of the phase")
+    name: Name = Field(description="name of the phase, unique in the scene")
     steps: Steps = Field(description="number of time steps; those of all phases add up to simulation.steps")
     catch: Success | None = Field(
         default=None,
@@ -170,6 +170,10 @@ def phase_problems(scene: Scene, sound: bool = True) -> Iterator[Problem]:
             f"have {total} steps together, the simulation has {scene.simulation.steps}: make them equal"
         )
         yield Problem(("phases",), total, sentence)
+    taken = [phase.name for phase in scene.phases]
+    for index, name in enumerate(taken):
+        if name in taken[:index]:
+            yield Problem(("phases", index, "name"), name, "another phase has this name: each needs its own")
     if not sound:
         return  # changes make scenes, all with the mistakes of this one
     names = {number.name for number in numbers(scene.replace(phases=()))}

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from dq_space_arm_env import DQSpaceArmEnv, Scene, compile_scene
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.start import episode_scene
@@ -287,9 +288,10 @@ class Demonstrations(Sequence[Demonstration]):
             The parts, each in the order of the problems.
 
         Raises:
+            TypeError: If a fraction is no number.
             ValueError: If a fraction is negative or NaN, or they exceed 1 together.
         """
-        ends = np.cumsum(fractions)
+        ends = np.cumsum(real_array("fractions", fractions, np.float64))
         if not fractions or not all(each >= 0.0 for each in fractions) or ends[-1] > 1.0 + 1e-9:
             raise ValueError(f"fractions: {fractions}, should be positive and at most 1 together")
         shuffled = np.random.default_rng(seed).permutation(len(self))

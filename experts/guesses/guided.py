@@ -115,7 +115,8 @@ class GuidedDDP:
                 the mirrored one if that finds a better minimum.
 
         Raises:
-            TypeError: If scene_or_problem is neither a scene nor a problem.
+            TypeError: If scene_or_problem is neither a scene nor a problem, or the library holds what is no
+                solution.
             ValueError: If a setting is out of range, no whole number or unknown, the problem contradicts
                 itself, or a solution of the library is not finite or has other sizes than the problem.
         """
@@ -470,7 +471,9 @@ def _interrupt(record: IterationRecord) -> None:
 
 
 def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> None:
-    """Raise ValueError if a solution does not fit a problem."""
+    """Raise TypeError for what is no solution, ValueError for one that does not fit a problem."""
+    if not isinstance(solution, Solution):
+        raise TypeError(f"{name} is of type {type(solution).__name__}; it must be a Solution")
     horizon, n_controls = problem.horizon, problem.n_controls
     check_array(f"{name}.states", solution.states, (horizon + 1, problem.n_states))
     check_array(f"{name}.controls", solution.controls, (horizon, n_controls))

@@ -200,6 +200,13 @@ NEAR = {
         ({"initial_state.joint_angles": [-30, 50, -90]}, r"initial_state.joint_angles: -30 rad: degrees\?"),
         ({"initial_state.joint_rates": [0, 90, 0]}, r"initial_state.joint_rates: 90 rad/s: degrees\?"),
         (
+            {
+                f"{key}.rotation": {"axis": [0, 0, 1], "angle": angle}
+                for key, angle in (("links.1.joint", 1.57), ("target.pose", -3.1416))
+            },
+            r"links\[1\].joint.rotation: 1.57 degrees: radians\? Likewise target.pose.rotation$",
+        ),
+        (
             {"constraints": [MANY]},
             r"constraints: limits of 'link 1': -170 rad: degrees\? Likewise 'link 2', 'link 3'$",
         ),
@@ -210,6 +217,10 @@ NEAR = {
         (
             {"target.motion": {"kind": "waypoints", "points": [{"time": t, "pose": {}} for t in (0, 20)]}},
             r"target.motion.points\[1\].time: 20 s, after the end of the episode at 15 s: the target",
+        ),
+        (
+            {"target.motion": {"kind": "waypoints", "points": [{"time": 1, "pose": {}}]}},
+            r"target.motion.points\[0\].pose: is not target.pose, from where the body moves as the points do",
         ),
         (
             {"target.motion": {"kind": "tumbling", "inertia": [4, 5, 6], "angular_velocity": [1, 3, 2]}},

@@ -95,6 +95,8 @@ def test_a_split_shares_no_problem(whole: Demonstrations):
     for fractions in ((), (0.7, 0.7), (-0.1,), (np.nan,), (0.5, np.nan)):
         with pytest.raises(ValueError, match="should be positive and at most 1 together"):
             whole.split(*fractions)
+    with pytest.raises(TypeError, match="fractions: of type <U1, should be real numbers"):
+        whole.split("a")
 
 
 @pytest.mark.parametrize("seed", [None, 5])

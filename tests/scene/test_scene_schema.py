@@ -312,6 +312,12 @@ def test_no_other_tip_hides_a_frame(name: str) -> None:
         scene.replace(other_tips=tips)
 
 
+def test_phases_have_names_of_their_own() -> None:
+    phases = [{"name": "coast", "steps": 400}, {"name": "coast", "steps": 600}]
+    with pytest.raises(SceneError, match=r"phases\[1\]\.name = 'coast': another phase has this name"):
+        load_scene("paper").replace(phases=phases)
+
+
 def test_mistakes_beside_phases_keep_their_place() -> None:
     phases = [{"name": "only", "steps": 900, "changes": {"base.mass": 90.0}}]
     scene = load_scene("wheels").model_dump() | {"phases": phases}

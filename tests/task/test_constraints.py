@@ -309,6 +309,13 @@ def test_limits_of_slides_are_lengths():
         load_scene("sliding").replace(constraints=[crossed])
 
 
+def test_limits_of_all_joints_that_cross_are_one_mistake():
+    crossed = {"kind": "joint_limits", "name": "it", "lower": 2.0, "upper": -2.0}
+    with pytest.raises(SceneError) as caught:
+        load_scene("paper").replace(constraints=[crossed])
+    assert str(caught.value).count("must be above") == 1
+
+
 def test_wheels_of_changing_masses_store_what_nobody_knows():
     scene = with_wheels()
     phases = [

@@ -285,6 +285,11 @@ def test_a_library_of_another_problem_is_refused(unicycle, changes, message):
         GuidedDDP(replace(unicycle, **changes), library=[solution])
 
 
+def test_a_library_of_something_else_is_refused(unicycle):
+    with pytest.raises(TypeError, match=r"library\[0\] is of type int; it must be a Solution"):
+        GuidedDDP(unicycle, library=[5])
+
+
 # Scenes ----------------------------------------------------------------------------------------------------
 
 
