@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from dq_space_arm_env.common.real_arrays import real_array
 from experts.ddp.box_ddp import BoxDDP
+from experts.ddp.second_order import SecondOrder
 from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason, uninterrupted
 from experts.guesses.attempts import Attempt, best_solution, is_known
 from experts.guesses.coarsening import checked_factors, find_coarsening
@@ -111,8 +112,9 @@ class GuidedDDP:
                 state; arms only.
             max_iterations: Most iterations from one guess.
             tolerance: See `BoxDDP`.
-            second_order: See `BoxDDP`; where long steps are tried and Gauss-Newton's model creeps, None takes
-                the mirrored one if that finds a better minimum.
+            second_order: See `BoxDDP`; where long steps are tried, None takes the mirrored model if
+                Gauss-Newton's creeps or misses the target, and the mirrored one finds a better minimum or
+                reaches it.
 
         Raises:
             TypeError: If scene_or_problem is neither a scene nor a problem, or the library holds what is no
@@ -398,14 +400,12 @@ class GuidedDDP:
         """Find how to solve this maneuver, or read what another process found."""
         key, known = None, None
         if type(self.problem) is ArmProblem and self._library is None and self._vacancies == 0:
-            names = ("attempts", "reach_target", "reserve")
-            settings = {**self._settings, **{name: getattr(self, name) for name in names}}
-            kinematic = self._kinematic_guess is not None
-            key = preparation_key(self.problem, {**settings, "screw_motion": kinematic})
+            key = preparation_key(self.problem, self._own_settings)
             known = read_preparation(key)
         if known is None:
             self._coarsening, self._coarse = find_coarsening(self)
             if key is not None:
+                self._take_model_that_reaches()
                 found = self._coarsening, self._solver.second_order.value, self._longest.library
                 keep_preparation(key, Preparation(*found))
             return
@@ -415,6 +415,30 @@ class GuidedDDP:
             self._coarse = self.in_long_steps(known.coarsening)
         self._longest._library = list(known.library)
         self._coarsening = known.coarsening
+
+    def _take_model_that_reaches(self) -> None:
+        """Take the mirrored model if only that reaches the target, from the problem's own start."""
+        if not self.chooses_model or not self.reach_target or self._reaches():
+            return
+        other = type(self)(self.problem, **self._own_settings | {"second_order": SecondOrder.MIRRORED.value})
+        if other._reaches():
+            self.take_model(other.second_order)
+            self._coarsening, self._coarse, self._library = other._coarsening, other._coarse, other._library
+
+    def _reaches(self) -> bool:
+        """Whether the maneuver from the problem's own start reaches the target."""
+        longest = self._longest
+        try:
+            return any(map(longest._is_good, longest.library)) or self._is_good(uninterrupted(self.solve()))
+        except KeyboardInterrupt:
+            self._coarsening = None  # the next access begins anew
+            raise
+
+    @property
+    def _own_settings(self) -> dict[str, Any]:
+        """The settings that a preparation follows from, by their names."""
+        own = {name: getattr(self, name) for name in ("attempts", "compare", "reach_target", "reserve")}
+        return {**self._settings, **own, "screw_motion": self._kinematic_guess is not None}
 
     @property
     def _longest(self) -> "GuidedDDP":
