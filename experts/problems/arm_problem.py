@@ -102,9 +102,9 @@ class ArmProblem:
         self.constraints = self.constraints_of(self.parameters)
         last = (rows[-1:] for rows in self.parameters.inputs)
         self.terminal_inputs: tuple[FloatArray, ...] = (*last, np.full(1, self._end_weight))
+        self.rate_limits = self._limits_of_rates()
 
-    @property
-    def rate_limits(self) -> RateLimits:
+    def _limits_of_rates(self) -> RateLimits:
         """Limits of how much controls change from stage to stage."""
         layout = self.kernels.layout
         state, tangent = layout.state.actuators, layout.tangent.actuators
