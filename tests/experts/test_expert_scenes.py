@@ -12,22 +12,6 @@ from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import PaperProblem
 from scripts.benchmarks.stability.expert import at_target
 
-COMPILED_ANYWAY = ("no-wrist", "paper", "planar")
-OF_A_KIND = ("dual-arm", "elastic-joints", "free-floating", "keep-out", "motors", "six-joint", "sliding")
-OF_A_KIND += ("thrusters", "tumbling", "wheels")
-EVERY_SCENE = [
-    pytest.param(
-        name,
-        marks=()
-        if name in COMPILED_ANYWAY
-        else pytest.mark.slow
-        if name in OF_A_KIND
-        else pytest.mark.endurance,
-    )
-    for name in list_scenes()
-]
-"""The derivatives of each scene take seconds to compile: other tests need those of the first three."""
-
 
 @pytest.fixture(scope="module")
 def paper_solution():
@@ -70,7 +54,7 @@ TWO_TARGETS = ("capture-and-detumble", "release")  # one after the other
 VIOLATED_THERE = ("line-of-sight", "pointing")  # the base as turned at the target looks elsewhere
 TWO_TIPS = ("dual-arm",)
 NOT_THERE = (*MOVING, *TWO_TARGETS, *TWO_TIPS, *VIOLATED_THERE)
-AT_REST = [case for case in EVERY_SCENE if case.values[0] not in NOT_THERE]
+AT_REST = [name for name in list_scenes() if name not in NOT_THERE]
 
 
 @pytest.mark.sampled
@@ -115,7 +99,8 @@ def test_gains_vanish_on_clamped_inputs(paper_solution):
     assert np.abs(paper_solution.feedback_gains).max() > 0.0
 
 
-@pytest.mark.parametrize("scene", EVERY_SCENE)
+@pytest.mark.sampled
+@pytest.mark.parametrize("scene", list_scenes())
 def test_every_scene_ends_with_a_truthful_reason(scene):
     solution = BoxDDP(scene, max_iterations=60).solve()
     kernels = compile_scene(scene)

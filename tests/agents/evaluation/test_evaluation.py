@@ -149,19 +149,19 @@ def test_optimal_costs_are_those_of_demonstrations(cache, tmp_path, quick):
 def test_optimal_costs_are_computed_once_and_go_on_where_they_were(cache, counting, quick):
     executor = counting(limit=1)
     with pytest.raises(KeyboardInterrupt):
-        optimal_costs(quick, 60, executor=executor)
+        optimal_costs(quick, 30, executor=executor)
     seen = []
     executor = counting()
-    first = optimal_costs(quick, 60, executor=executor, progress=lambda *done: seen.append(done))
-    assert executor.tasks == 2
-    assert seen == [(25, 60), (50, 60), (60, 60)]
+    first = optimal_costs(quick, 30, executor=executor, progress=lambda *done: seen.append(done))
+    assert executor.tasks == 1
+    assert seen == [(25, 30), (30, 30)]
     executor = counting()
-    again = optimal_costs(quick, 60, executor=executor)
+    again = optimal_costs(quick, 30, executor=executor)
     assert executor.tasks == 0
     np.testing.assert_array_equal(again.cost, first.cost)
     damaged = sorted(cache.rglob("*.json"))[1]
     damaged.write_text(damaged.read_text()[:-7])
-    repaired = optimal_costs(quick, 60, executor=executor)
+    repaired = optimal_costs(quick, 30, executor=executor)
     assert executor.tasks == 1
     np.testing.assert_array_equal(repaired.cost, first.cost)
 
