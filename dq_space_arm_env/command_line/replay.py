@@ -73,6 +73,8 @@ def replay(
     files = [Path(source, name).resolve() for _, source in sources for name in ("", "solution.npz")]
     if out.resolve() in files:
         raise ValueError(f"--out: {out} is one of the flights, which it would replace: name another file")
+    if out.resolve() in [Path(read).resolve() for read in (scene, normalize) if read is not None]:
+        raise ValueError(f"--out: {out} is read for the page, which would replace it: name another file")
     (shown, robot), *others = collect_flights(
         sources,
         None if scene is None else load_scene(scene),

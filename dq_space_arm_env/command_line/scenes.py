@@ -180,6 +180,15 @@ def _check_free(path: Path, force: bool) -> None:
         raise click.UsageError(f"{path} exists: give another name, or --force", click.get_current_context())
 
 
+def _check_kept(path: Path, source: str) -> None:
+    """Refuse to replace the file that a robot is read from, even by force."""
+    if path.is_file() and path.resolve() == Path(source).resolve():
+        raise click.UsageError(
+            f"--out: {path} is what is read, which it would replace: name another file",
+            click.get_current_context(),
+        )
+
+
 def _write(path: Path, text: str) -> None:
     from dq_space_arm_env.common.files import write_atomically
 
@@ -339,6 +348,7 @@ def import_(
     from dq_space_arm_env.command_line.scene_template import commented_yaml
 
     path = _scene_file(out or f"{Path(robot).stem}.yaml", force)
+    _check_kept(path, robot)
     arguments["name"] = arguments.get("name") or path.stem
     if replay:
         check_writable_file(path.with_suffix(".html"))
@@ -422,6 +432,7 @@ def export(
 
     if out is not None:
         _check_free(out, force)
+        _check_kept(out, scene)
     text = scene_exchange.export(scene, language, wrist)
     if out is None:
         sys.stdout.write(text)

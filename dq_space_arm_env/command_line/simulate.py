@@ -103,7 +103,8 @@ def simulate(
     loaded = load_scene(scene)
     if out is not None:
         check_writable_file(out)
-        if out.resolve() in [Path(given).resolve() for given in (scene, policy, start or "")]:
+        read = (scene, policy, start, normalize)
+        if out.resolve() in [Path(given).resolve() for given in read if given is not None]:
             raise ValueError(f"--out: {out} is what is flown, which it would replace: name another file")
     disturbance = read_noise(noise, loaded)
     if (drowned := drowned_inputs(disturbance, loaded)) is not None:

@@ -146,6 +146,10 @@ def test_a_flight_does_not_replace_what_it_came_from(
     assert file.read_bytes() == content
     assert main(["simulate", scene_file, "--policy", "zero", "--out", scene_file]) == UNUSABLE
     assert load_scene(scene_file).name
+    capsys.readouterr()
+    assert main(["simulate", "planar", "--normalize", str(file), "--out", str(file)]) == UNUSABLE
+    assert "which it would replace" in " ".join(capsys.readouterr().err.split())
+    assert file.read_bytes() == content
 
 
 def test_commands_to_copy_quote_their_files(

@@ -291,6 +291,19 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
     assert main([*words, "--out", "arm.txt"]) == UNUSABLE
 
 
+def test_the_robot_that_is_read_is_not_replaced_even_by_force(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, words in (
+        ("arm.yaml", ["import", "arm.yaml", "--tip", "hand", *CARRIED]),
+        ("scene.yaml", ["export", "scene.yaml", "--out", "./scene.yaml"]),
+    ):
+        Path(name).write_text("mine", encoding="utf-8")
+        assert main(["scenes", *words, "--force"]) == UNUSABLE
+        assert f"{name} is what is read, which it would replace" in capsys.readouterr().err
+        assert Path(name).read_text(encoding="utf-8") == "mine"
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
