@@ -186,9 +186,10 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
     def _spread(self, rows: dict[str, Any], times: dict[str, tuple[int, ...]]) -> list[Any]:
         """Repeat single rows, and parameters in time, up to the shapes of all."""
         counts = {name: len(array) for name, array in rows.items()}
-        count = max(counts.values())
-        if not set(counts.values()) <= {1, count}:
+        several = {count for count in counts.values() if count != 1}
+        if len(several) > 1:
             raise ValueError(f"batches differ in length: {counts}")
+        count = several.pop() if several else 1
         return [
             self._broadcast(array, (count, *times[name], array.shape[-1])) for name, array in rows.items()
         ]

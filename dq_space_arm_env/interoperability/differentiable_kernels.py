@@ -197,7 +197,7 @@ class DifferentiableKernels:
         inputs, parameters = _in_time(u, p)
         by_u, by_p = np.zeros_like(inputs), np.zeros_like(parameters)
         lowered = self._charts.lower(*(each.reshape(-1, x.shape[1]) for each in (kept, of_states)))
-        lowered = lowered.reshape(len(kept), len(x), -1)
+        lowered = lowered.reshape(len(kept), len(x), kernels.n_t)
         v = lowered[-1] + of_costs[-1] * kernels.terminal_cost_gradient(kept[-1], p=parameters[-1])
         before, unused = np.zeros_like(v), np.zeros_like(of_costs[:every])
         if with_parameters:

@@ -163,6 +163,20 @@ def test_parameters_of_each_step(torch):
     np.testing.assert_allclose(flown[-1], x, rtol=1e-13, atol=1e-13)
 
 
+def test_a_batch_of_no_states_has_no_results(torch):
+    """As of the kernels: a mask may leave none."""
+    kernels, dynamics = compile_scene("planar"), torch_dynamics("planar")
+    x = torch.zeros((0, kernels.n_x), dtype=torch.float64)
+    u = torch.zeros((STEPS, 0, kernels.n_u), dtype=torch.float64, requires_grad=True)
+    assert dynamics.step(x, u[0]).shape == dynamics.step(x, u.new_zeros(kernels.n_u)).shape == x.shape
+    assert dynamics.terminal_cost(x).shape == (0,)
+    for every in (1, 3):
+        states, costs = dynamics.rollout(x, u, every=every)
+        assert (states.shape, costs.shape) == ((STEPS // every + 1, 0, kernels.n_x), (STEPS + 1, 0))
+        (by_u,) = torch.autograd.grad(costs.sum() + states.sum(), u)
+        assert by_u.shape == u.shape
+
+
 def test_misuse_of_tensors_is_named(torch):
     dynamics = torch_dynamics("planar")
     _, states, inputs, _ = moving("planar")
@@ -295,6 +309,7 @@ def test_rollouts_in_jax_are_those_in_torch(kernels, jax, torch, short_scene):
     found, by_u = jax.vmap(jax.value_and_grad(cost, 1), (0, 1), (0, 1))(states, inputs)
     np.testing.assert_allclose(found.sum(), total.detach(), rtol=1e-12)
     np.testing.assert_allclose(by_u, u.grad, rtol=1e-10, atol=1e-10)
+    assert dynamics.cost(states[:0], inputs[0, :0]).shape == (0,)
 
 
 @pytest.mark.slow
