@@ -31,9 +31,9 @@ def free_name(wanted: str, taken: Collection[str]) -> str:
 def integrator_name(scene: Scene, integrator: str | None) -> str:
     """The scene's integrator, or the named one; ValueError if it is unknown."""
     name = scene.simulation.integrator if integrator is None else integrator
-    if name not in INTEGRATORS:
+    if not isinstance(name, str) or name not in INTEGRATORS:
         known = f"it must be one of {', '.join(INTEGRATORS)}"
-        raise ValueError(f"integrator: {name!r} is unknown; {did_you_mean(name, INTEGRATORS, known)}")
+        raise ValueError(f"integrator: {name!r} is unknown; {did_you_mean(str(name), INTEGRATORS, known)}")
     return name
 
 

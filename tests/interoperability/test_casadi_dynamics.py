@@ -113,3 +113,6 @@ def test_integrators_that_it_cannot_have_are_refused():
             casadi_dynamics(scene, name)
     with pytest.raises(ValueError, match=r"'rk5' is unknown; did you mean 'rk[468]'"):
         casadi_dynamics(scene, "rk5")
+    for name in (4, ["rk4"]):
+        with pytest.raises(ValueError, match=r"integrator: .*4.* is unknown; "):
+            casadi_dynamics(scene, name)
