@@ -109,9 +109,10 @@ class UrdfTree:
         return {link: self._path(link)[before:] for link in self._below(base)}
 
     def _known(self, link: str, argument: str) -> None:
-        if link in self.robot.links:
+        is_name = isinstance(link, str)
+        if is_name and link in self.robot.links:
             return
-        joint = self.robot.joints.get(link)
+        joint = self.robot.joints.get(link) if is_name else None
         hint = f"it is a joint, which carries link {joint.child!r}; " if joint else ""
         raise SceneError(
             f"{argument}: {link!r} is not a link of {self.robot.name!r}; "

@@ -135,6 +135,7 @@ def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
     [
         ({"tip": "amr"}, "tip: 'amr' is not a link of 'r'; did you mean 'arm'\\? its links are base, arm"),
         ({"tip": "arm", "base": "bus"}, "base: 'bus' is not a link of 'r'"),
+        ({"tip": ["arm"]}, r"tip: \['arm'\] is not a link of 'r'; did you mean 'arm'"),
         ({"tip": "base", "base": "arm"}, "joint 'j1' carries the base and not the tip; choose link 'base'"),
         ({"tip": "j1"}, "'j1' is not a link of 'r'; it is a joint, which carries link 'arm'; its links are"),
         ({"tip": "base"}, "tip: link 'base' is the base: choose a link that the joints move"),
