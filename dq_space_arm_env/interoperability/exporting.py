@@ -102,6 +102,12 @@ def refuse(
     if scene.actuators.tank is not None:
         problems.append("it has no tank that empties: set actuators.tank to null")
     problems += changed_robots(scene)
+    for link, (lower, upper, _) in zip(scene.links, joint_limits(scene), strict=True):
+        if lower >= upper:  # MuJoCo would ignore them, Pinocchio lock the joint
+            problems.append(
+                f"constraints limit joint {link.name!r} to {lower:g} {link.unit} or more and to {upper:g} "
+                f"{link.unit} or less, which leaves it no range: change one of them"
+            )
     geared = [link.name for link in scene.links if link.motor is not None and link.motor.inertia]
     if rotors and geared and not any(link.is_elastic for link in scene.links):
         problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")

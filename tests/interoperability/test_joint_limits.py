@@ -169,6 +169,15 @@ def test_the_tightest_limits_are_written(limited):
         assert joint_limits(scene_from_urdf(scene_to_urdf(scene), "tip", **more)) == TIGHTEST
 
 
+@pytest.mark.parametrize("write", [scene_to_urdf, scene_to_mjcf])
+def test_constraints_that_leave_no_range_are_refused(write, limited):
+    """MuJoCo would ignore the range, and our own reader refuse it."""
+    constraints = [*CONSTRAINTS, {"kind": "joint_limits", "name": "c", "lower": [2.5, -INF, -INF]}]
+    sentence = "limit joint 'link 1' to 2.5 rad or more and to 2.2 rad or less, which leaves it no range"
+    with pytest.raises(SceneError, match=sentence):
+        write(limited.replace(constraints=constraints))
+
+
 def test_large_limits_are_written_as_they_are(limited):
     """Also those that an import takes for placeholders; 1e4 stands for none."""
     limits = {"kind": "joint_limits", "name": "a", "lower": [-INF, -2e4, -1], "rate": [3e4, 1, INF]}
