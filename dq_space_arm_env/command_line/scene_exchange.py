@@ -180,14 +180,16 @@ def mounted(position: tuple[float, ...] | None, degrees: tuple[float, ...] | Non
 def _tips(path: Path, base: str | None) -> str:
     """Ends of arms, with what is between them and the base, and the other links."""
     robot = read_robot(path)
-    parents = {joint.parent for joint in robot.joints.values()}
-    ways = {}
-    for name, joints in UrdfTree(robot).ways(base).items():
+    tree, ways = UrdfTree(robot), {}
+    mimicked = tree.mimicked()
+    for name, joints in tree.ways(base).items():
         pose = functools.reduce(dual_quaternion.multiply, (joint.origin for joint in joints), HERE)
-        mimics = any(joint.mimics for joint in joints)  # no tip hangs on these
-        moving = 0 if mimics else sum(joint.type != "fixed" for joint in joints)
+        # No tip hangs on joints that mimic others, or are mimicked by those of a mass.
+        bound = any(joint.mimics or joint.name in mimicked for joint in joints)
+        moving = 0 if bound else sum(joint.type != "fixed" for joint in joints)
         ways[name] = moving, math.hypot(*poses.to_rotation_and_position(pose)[1])
-    ends = [name for name, (moving, _) in ways.items() if name not in parents and moving]
+    onward = {joint.parent for joint in robot.joints.values() if ways.get(joint.child, (0,))[0]}
+    ends = [name for name, (moving, _) in ways.items() if name not in onward and moving]
     ends = sorted(ends, key=ways.__getitem__, reverse=True)[:_MOST_ENDS]
     width = max((len(name) for name in ends), default=0)
     rows = [

@@ -108,6 +108,11 @@ class UrdfTree:
         before = len(self._path(base))
         return {link: self._path(link)[before:] for link in self._below(base)}
 
+    def mimicked(self) -> set[str]:
+        """Names of the joints that others, which move a mass, mimic."""
+        joints = self.robot.joints.values()
+        return {each.mimics for each in joints if each.mimics and self._has_mass_beyond(each, each.parent)}
+
     def _known(self, link: str, argument: str) -> None:
         is_name = isinstance(link, str)
         if is_name and link in self.robot.links:

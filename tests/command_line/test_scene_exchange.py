@@ -291,6 +291,22 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
     assert main([*words, "--out", "arm.txt"]) == UNUSABLE
 
 
+def test_fingers_that_others_mimic_are_no_tips(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The import refuses them, as a scene's joints move by themselves; what has no mass may mimic any."""
+    body = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+    text = Path(ARM).read_text(encoding="utf-8").replace("</robot>", "")
+    for name, mimics, content in (("finger", "", body), ("other", "finger", body), ("dial", "shoulder", "")):
+        text += f'<link name="{name}">{content}</link><joint name="{name}" type="revolute">'
+        text += f'<parent link="hand"/><child link="{name}"/>'
+        text += f'<mimic joint="{mimics}"/></joint>' if mimics else "</joint>"
+    Path("gripper.urdf").write_text(f"{text}</robot>", encoding="utf-8")
+    assert main(["scenes", "import", "gripper.urdf"]) == UNUSABLE
+    listed = " ".join(capsys.readouterr().err.split())
+    assert re.search(": hand 2 joints, .* others mount, upper arm, forearm, finger, other, dial$", listed)
+    assert main(["scenes", "import", "gripper.urdf", "--tip", "finger", *CARRIED]) == UNUSABLE
+    assert "joint 'other' mimics joint 'finger' of the chain" in capsys.readouterr().err
+
+
 def test_the_robot_that_is_read_is_not_replaced_even_by_force(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
