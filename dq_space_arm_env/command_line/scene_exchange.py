@@ -125,7 +125,8 @@ def import_urdf(
         )
     if proposals.wheels != "ideal":
         scene = with_wheels(scene, proposals.wheels)
-    if proposals.thrusters != "ideal" and scene.actuators.base_force is not None:
+    if proposals.thrusters != "ideal":
+        assert scene.actuators.base_force is not None
         scene = with_jets(scene, 0.5 * max(scene.actuators.base_force.limit))
     scene = scene.replace(spread=_spread(scene, proposals.spread), success=_success(scene))
     steps = tuple(measured_steps(scene)) if proposals.measured else ()

@@ -373,6 +373,12 @@ def import_(
             "leave one of them out",
             context,
         )
+    if thrusters != "ideal" and base_force == 0.0:
+        raise click.UsageError(
+            f"--base-force 0 is for no thrusters, and those of --thrusters {thrusters} have half of it each: "
+            "leave one of them out",
+            context,
+        )
     if spacecraft:
         spacecraft["mount"] = scene_exchange.mounted(mount, mount_rotation)
     arguments |= {

@@ -346,6 +346,10 @@ def test_the_robot_that_is_read_is_not_replaced_even_by_force(
             [*HAND, *CARRIED, "--wheels", "pyramid", "--base-torque", "3"],
             "--base-torque limits ideal wheels, and those of --wheels pyramid are in size for the base",
         ),
+        (
+            [*HAND, *CARRIED, "--thrusters", "jets", "--base-force", "0"],
+            "--base-force 0 is for no thrusters, and those of --thrusters jets have half of it each",
+        ),
         ([*HAND, *CARRIED, "--joint-torque", "0"], "--joint-torque = 0.0: must be a number"),
         (["import", ARM, "--tip", "mount", "--base", "hand"], "choose link '.*', or .* above it, as --base$"),
         (["import", "nowhere.urdf", "--tip", "hand"], "nowhere.urdf: there is no such file"),
