@@ -52,4 +52,7 @@ def balanced(inertia: Array) -> Array:
 def tidied(numbers: Array) -> Array:
     """Round to 15 digits of the largest number, against residues of rotations and translations."""
     largest = float(np.abs(numbers).max())
-    return np.round(numbers, 15 - math.ceil(math.log10(largest))) if 0.0 < largest < math.inf else numbers
+    if not 0.0 < largest < math.inf:
+        return numbers
+    # NumPy multiplies by this power of ten, which must be finite.
+    return np.round(numbers, min(15 - math.ceil(math.log10(largest)), 300))

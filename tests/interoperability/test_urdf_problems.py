@@ -337,6 +337,13 @@ def test_digits_stay_as_they_were_given():
     assert part.inertia == ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.1))
 
 
+@pytest.mark.parametrize("tiny", ["1e-292", "-1e-300", "5e-324"])
+def test_numbers_next_to_zero_are_numbers(tiny):
+    text = robot(*GOOD).replace("<limit", f'<origin xyz="0 0 {tiny}"/><limit')
+    (part,) = scene_from_urdf(text, "arm").links
+    assert part.joint.position == pytest.approx((0.0, 0.0, 0.0), abs=1e-290)
+
+
 def test_friction_is_left_out_with_a_warning():
     text = robot(*GOOD).replace("<limit", '<dynamics friction="0.1"/><limit')
     with pytest.warns(UserWarning, match="Coulomb friction of j1 is left out"):
