@@ -441,6 +441,9 @@ def export(
         _check_kept(out, scene)
     text = scene_exchange.export(scene, language, wrist)
     if out is None:
+        # XML is UTF-8 unless it says otherwise; where the terminal is not, names get references.
+        if (sys.stdout.encoding or "").lower().replace("-", "") != "utf8":
+            text = text.encode("ascii", "xmlcharrefreplace").decode()
         sys.stdout.write(text)
     else:
         _write(out, text)

@@ -413,6 +413,17 @@ def test_export_writes_the_robot(name: str, here: Path, capsys: pytest.CaptureFi
     assert [link.name for link in load_scene("again.yaml").links] == [link.name for link in scene.links]
 
 
+def test_names_survive_a_terminal_of_another_encoding(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = {f"links.{index}.name": name for index, name in enumerate(("Glied 1", "Händler", "手"))}
+    Path("arm.yaml").write_text(load_scene("no-wrist").replace(names).to_yaml(), encoding="utf-8")
+    for encoding in ("latin-1", "utf-8"):
+        with monkeypatch.context() as patch, Path("arm.urdf").open("w", encoding=encoding) as file:
+            patch.setattr("sys.stdout", file)
+            assert main(["scenes", "export", "arm.yaml"]) == SUCCESS
+        links = scene_from_urdf(Path("arm.urdf"), "tip").links
+        assert [link.name for link in links] == [*names.values()]
+
+
 def test_links_and_joints_are_completed() -> None:
     def words(part: str, file: str | None, incomplete: str) -> list[str]:
         context = click.Context(click.Command("import"))
