@@ -193,6 +193,8 @@ def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
             raise UnreadableError(f"facts: {key} is {shortened(value)}, it should be a {_word(kind)}")
         if value is not None and name != "label":
             found[name] = value
+    if found.get("seed", 0) < 0:
+        raise UnreadableError(f"facts: seed is {shortened(found['seed'])}, it should be 0 or greater")
     if scene is not None:
         if not isinstance(scene, dict):
             raise UnreadableError(f"facts: scene is {shortened(scene)}, it should be a mapping")

@@ -34,6 +34,13 @@ def test_what_is_known_comes_back(tmp_path: Path) -> None:
     assert (found.cost, found.seed) == (3.5, 3)
 
 
+def test_a_seed_below_zero_is_refused(tmp_path: Path) -> None:
+    """No episode has one: policies that a replay starts there would fail."""
+    Trajectory("bare", STATES, CONTROLS, seed=-3).save(tmp_path / "flight.npz")
+    with pytest.raises(ValueError, match=r"flight.npz cannot be .* seed is -3, it should be 0 or greater"):
+        Trajectory.load(tmp_path / "flight.npz")
+
+
 @pytest.mark.parametrize("shape", [(8,), (4, 8)])
 @pytest.mark.parametrize("name", ["target", "target_body"])
 def test_a_target_rests_or_has_a_pose_for_each_state(
