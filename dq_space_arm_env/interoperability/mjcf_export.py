@@ -68,7 +68,8 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     Raises:
         SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, a screw
             joint, reaction wheels, a tank, an elastic gear, a rotor that turns with the body before its
-            joint, an actuator that lags or delays, or phases that change the robot.
+            joint, an actuator that lags or delays, a joint that constraints leave no range, or phases that
+            change the robot.
     """
     scene = load_scene(scene)
     refuse(scene, "MJCF", wrist, at_once=True)

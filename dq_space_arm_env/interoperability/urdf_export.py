@@ -48,7 +48,7 @@ def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
         The URDF text, all numbers with 17 digits; `scene_from_urdf` reads it.
 
     Raises:
-        SceneError: If URDF lacks a feature of the scene.
+        SceneError: If URDF lacks a feature of the scene, or its constraints leave a joint no range.
     """
     scene = load_scene(scene)
     refuse(scene, "URDF", wrist, springs=True, planar=True, rotors=True, spherical=True)
