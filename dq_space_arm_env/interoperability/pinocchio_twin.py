@@ -125,12 +125,15 @@ def to_pinocchio(scene: Scene | str | Path, x: ArrayLike) -> tuple[Array, Array]
 
     Raises:
         TypeError: If x is masked, or not of real numbers.
-        ValueError: If x has another shape, or the scene reaction wheels or a tank (`SceneError`).
+        ValueError: If x has another shape, a quaternion is no unit one within 1e-6, or the scene has reaction
+            wheels or a tank (`SceneError`).
     """
     scene = load_scene(scene)
     equations, entries = _equations(scene), StateLayout.of(scene).state
     values = _checked("x", x, equations.n_x)
+    quaternions = unit_quaternions(scene)
     pose = tuple(equations.pose.full(values[entries.pose].tolist()))
+    _check_lengths("x", pose[:4], *(values[where] for where in quaternions))
     position, (w, i, j, k) = poses.position(pose), pose[:4]
     motion = equations.motion(values[entries.pose.stop :].tolist())
     if equations.tree.planar:
@@ -139,7 +142,7 @@ def to_pinocchio(scene: Scene | str | Path, x: ArrayLike) -> tuple[Array, Array]
     else:
         base, velocity = [*position, i, j, k, w], [*motion.linear, *motion.angular]
     values = values.copy()
-    for where in unit_quaternions(scene):
+    for where in quaternions:
         values[where] = np.roll(values[where], -1)
     angles, rates = _places(scene)
     joints = values[entries.joint_angles][angles]
@@ -186,9 +189,9 @@ def from_pinocchio(
     angles, rates = angles[np.argsort(ours[0])], rates[np.argsort(ours[1])]
     previous = np.zeros(layout.n_x - layout.state.joint_rates.stop)
     x = np.array([*base, *angles, *wrist, *twist, *rates, *previous], dtype=np.float64)
-    for part in (configuration[2:4] if planar else configuration[3:7], *(x[where] for where in quaternions)):
-        if not abs(np.linalg.norm(part) - 1.0) <= _UNIT_TOLERANCE:
-            raise ValueError(f"q: {part} has norm {np.linalg.norm(part):.9g}, it must be 1 within 1e-6")
+    _check_lengths(
+        "q", configuration[2:4] if planar else configuration[3:7], *(x[each] for each in quaternions)
+    )
     for where in quaternions:
         x[where] = np.roll(x[where], 1)
     return x
@@ -249,6 +252,13 @@ def _checked(name: str, values: ArrayLike, size: int) -> Array:
     if array.shape != (size,):
         raise ValueError(f"{name}: shape {array.shape}, it must be ({size},)")
     return array
+
+
+def _check_lengths(name: str, *quaternions: ArrayLike) -> None:
+    """Raise ValueError for quaternions (or cosine and sine) that are no unit ones."""
+    for part in map(np.asarray, quaternions):
+        if not abs(np.linalg.norm(part) - 1.0) <= _UNIT_TOLERANCE:
+            raise ValueError(f"{name}: {part} has norm {np.linalg.norm(part):.9g}, it must be 1 within 1e-6")
 
 
 def _inertia(pin: Any, body: RigidBody) -> Any:

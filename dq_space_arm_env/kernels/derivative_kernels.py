@@ -205,12 +205,13 @@ class DerivativeKernels(ConstraintKernels):
         return self.call(name, integrator, x=x, u=u, h=self._time_step(dt), p=p, **others)
 
     def _integrator(self, name: str | None) -> str | None:
-        if name is not None and name not in INTEGRATORS:
+        if name is not None and not (isinstance(name, str) and name in INTEGRATORS):
             raise ValueError(f"integrator: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
         return name
 
     def _time_step(self, dt: float | None) -> Array:
-        step = self.scene.simulation.dt if dt is None else float(dt)
-        if not isfinite(step):
-            raise ValueError(f"dt: {step} is not a finite time step in s")
+        step: Any = self.scene.simulation.dt if dt is None else dt
+        is_number = isinstance(step, float | int | np.floating | np.integer) and not isinstance(step, bool)
+        if not (is_number and isfinite(step)):
+            raise ValueError(f"dt: {step!r} is not a finite time step in s")
         return np.array([step], self.dtype)

@@ -105,6 +105,9 @@ def test_configurations_that_turn_nowhere_are_refused(name, q):
     scene = load_scene(name)
     with pytest.raises(ValueError, match=r"q: .* has norm [02], it must be 1 within 1e-6"):
         from_pinocchio(scene, q, np.zeros(len(q) - 1))
+    state = StateLayout.of(scene).initial_state
+    with pytest.raises(ValueError, match=r"x: .* has norm 2, it must be 1 within 1e-6"):
+        to_pinocchio(scene, 2.0 * state)
 
 
 def test_what_is_no_real_number_is_refused():

@@ -59,7 +59,10 @@ def test_inputs_are_not_changed_and_need_not_be_contiguous(draw):
         (lambda k, x, u: k.step(x[None, None], u), r"x: shape \(1, 1, 23\)"),
         (lambda k, x, u: k.step(np.tile(x, (2, 1)), np.tile(u, (3, 1))), "batches differ in length"),
         (lambda k, x, u: k.step(x, u, integrator="rk5"), "integrator: 'rk5' is unknown; choose from .*rk4"),
+        (lambda k, x, u: k.step(x, u, integrator=["rk4"]), r"integrator: \['rk4'\] is unknown; choose from"),
         (lambda k, x, u: k.step(x, u, dt=float("nan")), "dt: nan is not a finite time step"),
+        (lambda k, x, u: k.step(x, u, dt="a"), "dt: 'a' is not a finite time step"),
+        (lambda k, x, u: k.step(x, u, dt=True), "dt: True is not a finite time step"),
     ],
 )
 def test_wrong_arguments_are_named(call, message, draw):
