@@ -96,8 +96,9 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         taken, resting, weight = np.zeros(self.num_envs, np.int64), none, 1.0
         finished: list[_Finished] = []
         infos: list[list[Info]] = [[] for _ in range(self.num_envs)]
+        moves = actions
         for step in range(self.repeat):
-            observations, rewards, terminated, truncated, info = self.env.step(actions)
+            observations, rewards, terminated, truncated, info = self.env.step(moves)
             total = np.where(resting, total, total + weight * rewards if self._sum else rewards)
             plain = rewards if self._shaper is None else self._shaper.unshaped
             collected = np.where(resting, collected, collected + plain)
@@ -116,6 +117,8 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
                 state = home.get_state(rows)
                 finished.append(_Finished(rows, observations, terminated, truncated, info, state))
                 resting = resting | over
+                # That of a reset does not matter, so it may be NaN; those that wait would fly with it.
+                moves = np.where(resting[:, None], 0.0, actions)
                 if mode is AutoresetMode.DISABLED:  # for the others to go on
                     home.reset(options={"reset_mask": over})
         for each in finished:

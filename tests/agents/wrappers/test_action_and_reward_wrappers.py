@@ -80,6 +80,23 @@ def test_vector_wrappers_are_bit_equal_to_single_ones(mode):
     assert max(costs) > 0.0
 
 
+def test_actions_of_sub_environments_that_reset_do_not_matter():
+    envs = [vector.RepeatAction(gymnasium.make_vec("DQSpaceArm-v0", 2, scene=EIGHT_STEPS), 3) for _ in "ab"]
+    actions = np.tile(STILL, (2, 1))
+    for env in envs:
+        env.reset(seed=0)
+        env.step(actions)
+        env.reset(options={"reset_mask": np.array([True, False])})
+        for _ in range(2):
+            result = env.step(actions)
+        np.testing.assert_array_equal(result[2], [False, True])
+    missing = actions.copy()
+    missing[1] = np.nan
+    assert_same(envs[0].step(missing), envs[1].step(actions))
+    with pytest.raises(ValueError, match=r"actions: NaN for sub-environments \[1\]"):
+        envs[0].step(missing)
+
+
 def test_a_decision_is_the_sum_of_its_steps_and_ends_with_its_episode():
     scene = PAPER.replace(simulation={"steps": 6})
     env, plain = held(scene=scene, step_infos=True), gymnasium.make("DQSpaceArm-v0", scene=scene)
