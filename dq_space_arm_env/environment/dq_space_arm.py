@@ -514,7 +514,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
         Raises:
             ValueError: If the options are no mapping, or one is unknown or excludes another; if state or target has a wrong shape, is not finite, or its pose is not a unit
-                dual quaternion; if actuators keep what is beyond their limits in the state, or a tank less than nothing; if the scene's target does not vary; or if no scene
+                dual quaternion; if the target is too far away; if actuators keep what is beyond their limits in the state, or a tank less than nothing; if the scene's target does not vary; or if no scene
                 may have the parameters (`SceneError`).
         """
         given = checked_options(options)

@@ -76,9 +76,9 @@ def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:
 
     Raises:
         ValueError: If an option is unknown; if nominal is not a bool; if a number is missing or not finite;
-            if the pose of the base or the target is not a unit dual quaternion; if actuators keep what is
-            beyond their limits, or a tank less than nothing; if the scene's target is a constant; or if no
-            scene may have the parameters (`SceneError`).
+            if the pose of the base or the target is not a unit dual quaternion; if the target is too far
+            away; if actuators keep what is beyond their limits, or a tank less than nothing; if the scene's
+            target is a constant; or if no scene may have the parameters (`SceneError`).
     """
     unknown = set(options) - set(_OPTIONS)
     if unknown:
@@ -171,6 +171,12 @@ def check_scene(scene: Scene) -> None:
             f"{start + width:.3g}, should be at most {STATE_LIMIT:g}, beyond which a simulation counts as "
             "diverged"
         )
+    _check_lengths(scene)
+
+
+def _check_lengths(scene: Scene) -> None:
+    """Raise ValueError for a scene whose tip may be so far from the target that no observation holds it."""
+    spread = scene.spread
     lengths = {
         f"links[{index}].joint.position": link.joint.position for index, link in enumerate(scene.links)
     }
@@ -236,11 +242,17 @@ def _checked_target(kernels: Kernels, target: Any) -> Array:
             f"options: target {pose} leaves the plane, its entries {fixed} should be 0 in a planar scene"
         )
     pose[fixed] = 0.0
+    distance = math.hypot(*poses.position(pose))
+    if distance > STATE_LIMIT:
+        raise ValueError(
+            f"options: target is {distance:.3g} m from the origin, should be at most {STATE_LIMIT:g} m, for "
+            "observations to hold it"
+        )
     return pose
 
 
 def _checked_parameters(kernels: Kernels, parameters: Any) -> Array:
-    """Parameters with which the scene is valid: a mass may not be negative."""
+    """Parameters with which the environment takes the scene: a mass may not be negative."""
     values = _finite("parameters", parameters, kernels.n_p)
     nominal, names = kernels.parameters.nominal, kernels.parameters.names
     other = [index for index in kernels.parameters.staged if values[index] != nominal[index]]
@@ -264,8 +276,11 @@ def _checked_parameters(kernels: Kernels, parameters: Any) -> Array:
 
 @lru_cache(maxsize=1024)
 def _check_values(kernels: Kernels, parameters: tuple[float, ...]) -> None:
-    """Raise SceneError for parameters that no scene may have; episodes often share theirs."""
-    episode_scene(kernels.scene, parameters)
+    """Raise SceneError for parameters that no scene may have; episodes often share theirs.
+
+    ValueError for those with which observations would not hold the target.
+    """
+    _check_lengths(episode_scene(kernels.scene, parameters))
 
 
 def _finite(name: str, value: Any, size: int) -> Array:

@@ -94,6 +94,7 @@ def test_a_start_has_the_sign_of_the_given_target(scene):
         ("named", {"payload__mass": np.nan}, "should be finite numbers"),
         ("named", {"payload__mass": -1.0}, "payload.mass = -1"),
         ("named", {"target__pose": np.ones(8)}, "target"),
+        ("named", {"target__pose": [1.0, 0, 0, 0, 0, 5e5, 0, 0]}, r"pose\.position: 1e\+06 m; lengths of"),
         ("named", "no", "parameters"),
     ],
 )

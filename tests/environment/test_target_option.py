@@ -100,6 +100,11 @@ def test_copies_are_single_environments_with_the_same_targets(rows, started):
     [
         ("paper", TARGET, "has the same in every episode.*give the scene a spread of target_pos"),
         ("random-target", TARGET[:7], r"shape \(7,\), should be finite numbers of shape \(8,\)"),
+        (
+            "random-target",
+            pose((0.3, -1.0, 0.5), (0.0, 1e6, 0.0)),
+            r"target is 1e\+06 m from the origin, should be at most 500000 m",
+        ),
         ("random-target", 1.1 * TARGET, r"target is a pose with \|q_r\| = 1\.1"),
         (PLANAR, TARGET, r"leaves the plane, its entries \[1, 2, 4, 7\] should be 0"),
     ],
