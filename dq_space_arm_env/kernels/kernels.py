@@ -126,7 +126,7 @@ class Kernels(DerivativeKernels):
             NaN where one of the two is not finite.
 
         Raises:
-            ValueError: If the shapes do not fit.
+            ValueError: If the shapes do not fit, or there are more steps than the scene's phases have.
         """
         from dq_space_arm_env.kernels.numerical_error import companion, numerical_error
 

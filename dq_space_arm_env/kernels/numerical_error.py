@@ -43,6 +43,11 @@ def numerical_error(finer: RobotKernels, states: ArrayLike, u: ArrayLike, p: Arr
         )
     x, errors = motion[0].astype(np.float64), np.zeros(motion.shape[:-1])
     stages = _stages(finer, p)
+    if stages is not None and len(controls) >= len(stages):
+        raise ValueError(
+            f"u: {len(controls)} steps, should be at most {len(stages) - 1}: the phases of scene "
+            f"{finer.scene.name!r} end then"
+        )
     for step, control in enumerate(controls, start=1):
         own = p if stages is None else stages[step - 1]
         x = finer.call("checked_step", x=x, u=control, p=own)[0]

@@ -42,6 +42,14 @@ SCENES = {name: shortened(name) for name in ("capture-and-detumble", "release", 
 SCENES["refuelling"] = SCENES["refuelling"].replace({"phases.2.changes.cost.base_torque": 3.0})
 
 
+def test_a_motion_with_more_steps_than_the_phases_has_no_numerical_error() -> None:
+    kernels = compile_scene(SCENES["release"])
+    steps = kernels.scene.simulation.steps + 1
+    states = np.tile(kernels.layout.initial_state, (steps + 1, 1))
+    with pytest.raises(ValueError, match=rf"u: {steps} steps, should be at most {steps - 1}: the phases"):
+        kernels.numerical_error(states, np.zeros((steps, kernels.n_u)))
+
+
 @pytest.mark.sampled
 @pytest.mark.parametrize("name", SCENES)
 def test_an_episode_costs_what_the_kernels_say_stage_by_stage(name: str) -> None:
