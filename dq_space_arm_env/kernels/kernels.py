@@ -163,11 +163,12 @@ class Kernels(DerivativeKernels):
             States, the start first, shape (steps // every + 1, n_x).
 
         Raises:
-            ValueError: If steps or every is not positive, dt is not a finite number, or the integrator is
-                unknown.
+            ValueError: If steps or every is no positive whole number, dt is not a finite number, or the
+                integrator is unknown.
         """
-        if steps < 1 or every < 1:
-            raise ValueError(f"steps: {steps}, every: {every}, should be at least 1")
+        for name, count in (("steps", steps), ("every", every)):
+            if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+                raise ValueError(f"{name}: {count!r}, should be a whole number of at least 1")
         start, inputs = real_array("x", x, self.dtype), real_array("u", u, self.dtype)
         if start.shape != (self.n_x,) or inputs.shape not in ((self.n_u,), (steps, self.n_u)):
             raise ValueError(

@@ -63,6 +63,9 @@ def test_inputs_are_not_changed_and_need_not_be_contiguous(draw):
         (lambda k, x, u: k.step(x, u, dt=float("nan")), "dt: nan is not a finite time step"),
         (lambda k, x, u: k.step(x, u, dt="a"), "dt: 'a' is not a finite time step"),
         (lambda k, x, u: k.step(x, u, dt=True), "dt: True is not a finite time step"),
+        (lambda k, x, u: k.simulate(x, u, 0), "steps: 0, should be a whole number of at least 1"),
+        (lambda k, x, u: k.simulate(x, u, 2.5), "steps: 2.5, should be a whole number of at least 1"),
+        (lambda k, x, u: k.simulate(x, u, 4, every=2.0), "every: 2.0, should be a whole number"),
     ],
 )
 def test_wrong_arguments_are_named(call, message, draw):
