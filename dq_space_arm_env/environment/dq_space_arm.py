@@ -395,7 +395,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
         Returns:
             Arrays by name, for `set_state`, of this environment or another of the same scene: the state "x", shape (n_x,); "memory" of the
-            step (number, sign of the error, stage cost), and "parameters"; in scenes that let a payload go "adrift", shape (15,), its pose and
+            step (number, terms of the stage cost, target that moves, whether the payload is held), and "parameters"; in scenes that let a payload go "adrift", shape (15,), its pose and
             twist then, see `Payloads`; whether the episode is "over"; and the state of the random "generator". `ResetNeeded` before the first reset.
         """
         self._require_reset("get_state()")
