@@ -58,7 +58,7 @@ def catches(
             continue
         p = stages[stage - 1].copy()
         p[entries.indices(CATCH)] = 0.0  # before the impact
-        x = kernels.step(states[step], kernels.applied_inputs(states[step], inputs[step], p=p), p=p)
+        x = _stepped(kernels, states[step], kernels.applied_inputs(states[step], inputs[step], p=p), p)
         if moving and staged.resting[index - 1] is None:
             p[moving] = target_path(kernels, stages[0, moving])[stage]
         tip, target = (tuple(each.tolist()) for each in (kernels.tip_pose(x, p=p), layout.target_with(p)))
@@ -68,3 +68,11 @@ def catches(
         errors = (turned, moved, turning, np.linalg.norm(twist[3:]))
         found.append(Catch(phase.name, stage - 1, tuple(map(float, errors)), phase.catch))
     return found
+
+
+def _stepped(kernels: Kernels, x: ArrayLike, u: ArrayLike, p: ArrayLike) -> NDArray[np.float64]:
+    """State after a step as environments take it: divided where it would err by more than the tolerance."""
+    simulation = kernels.scene.simulation
+    if simulation.estimates_error(simulation.integrator):
+        return kernels.checked_step(x, u, p=p)[0]
+    return kernels.step(x, u, p=p)

@@ -170,10 +170,15 @@ def test_solutions_fly_as_planned(solved: Path, scene_file: str, capsys: pytest.
 
 
 @pytest.mark.slow
-def test_catches_are_judged_as_environments_judge_them() -> None:
-    """Each error a little within its tolerance, then beyond it, of a target that tumbles."""
-    lengths = {f"phases.{index}.steps": steps for index, steps in enumerate((6, 1, 5))}
-    short = load_scene("capture-and-detumble").replace({**lengths, "simulation.steps": 12})
+@pytest.mark.parametrize("stiffness", [0.0, 2e4])
+def test_catches_are_judged_as_environments_judge_them(stiffness: float) -> None:
+    """Each error a little within its tolerance, then beyond it, of a target that tumbles.
+
+    With stiff springs too, where steps are divided and end elsewhere than a whole one.
+    """
+    changes: dict[str, Any] = {f"phases.{index}.steps": steps for index, steps in enumerate((6, 1, 5))}
+    changes |= {f"links.{index}.stiffness": stiffness for index in (1, 2)}
+    short = load_scene("capture-and-detumble").replace({**changes, "simulation.steps": 12})
     start = begin(short)
     rng, shape = np.random.default_rng(1), (12, DQSpaceArmEnv(short).kernels.n_u)
     inputs = rng.uniform(-1.0, 1.0, shape)
