@@ -16,7 +16,7 @@ from agents.configuration.schema import Mismatch
 from agents.evaluation.plans import FloatArray, Followed, Plans
 from agents.residual.corrections import CorrectionObserver, corrected
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
-from dq_space_arm_env.environment.disturbances import Disturbances, with_loads
+from dq_space_arm_env.environment.disturbances import Disturbances, displaced, with_loads
 from experts.demonstrations import Demonstrations
 
 Info = dict[str, Any]
@@ -179,7 +179,7 @@ class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any
         assert draw.push is not None
         assert draw.measurement is not None
         self._worlds.perturb(np.tile(draw.push, (2, 1)))
-        measured = kernels.retract(self._worlds.states, np.tile(draw.measurement, (2, 1)))
+        measured = displaced(kernels, self._worlds.states, np.tile(draw.measurement, (2, 1)))
         followed = self._plans.follow(kernels, self._stage, measured)
         self._uncorrected = followed.action
         few = Followed(*(part[:count] for part in followed))

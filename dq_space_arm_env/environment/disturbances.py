@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.parameters import Number, body_numbers, is_part
+from dq_space_arm_env.scene.start import unit_quaternions
 
 FloatArray = NDArray[np.float64]
 
@@ -100,6 +102,18 @@ class Disturbances:
         strength = self._rng.standard_normal(push[:, self._velocity].shape)
         push[:, self._velocity] = np.where(struck, self._push * strength, 0.0)
         return push
+
+
+def displaced(kernels: Kernels, x: NDArray[Any], increments: FloatArray) -> NDArray[Any]:
+    """Displace states, shape (B, n_x), by tangent coordinates, (B, n_t).
+
+    Quaternions of spherical joints, which a retraction adds to, get their unit length back.
+    """
+    moved = kernels.retract(x, increments)
+    for where in unit_quaternions(kernels.scene):
+        rows = (moved[:, where] != x[:, where]).any(axis=1)  # the others keep their bits
+        moved[rows, where] /= np.linalg.norm(moved[rows, where], axis=1, keepdims=True)
+    return moved
 
 
 def load_place(scene: Scene) -> str | None:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.shown_text import shortened
-from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances
+from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances, displaced
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
@@ -212,7 +212,7 @@ def rollout(
             environment.perturb(disturbance.push)
             log.state = measured = environment.states
         if disturbance.measurement is not None:
-            measured = environment.kernels.retract(log.state, disturbance.measurement)
+            measured = displaced(environment.kernels, log.state, disturbance.measurement)
         if measured is not known and observes:
             observation = environment.observe(measured)
         began = perf_counter()

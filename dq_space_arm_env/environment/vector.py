@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.shown_text import shortened
+from dq_space_arm_env.environment.disturbances import displaced
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.reset_options import GivenStart, checked_options, given_start, saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
@@ -335,7 +336,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
 
         Args:
             increments: Tangent coordinates in the order of `kernels.layout.tangent`, shape (num_envs, n_t),
-                rad, m, rad/s, m/s; sub-environments whose row is zero stay exactly as they are.
+                rad, m, rad/s, m/s; sub-environments whose row is zero stay exactly as they are. Quaternions
+                of spherical joints get their unit length back.
 
         Raises:
             ResetNeeded: Before the first reset.
@@ -351,7 +353,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             raise ValueError(f"increments: {shortened(increments)}, should be finite")
         rows = np.flatnonzero(increments.any(axis=1))
         if len(rows):
-            self._envs.move(rows, self.kernels.retract(self._envs.x[rows], increments[rows]))
+            self._envs.move(rows, displaced(self.kernels, self._envs.x[rows], increments[rows]))
             if self._seen is not None:
                 self._seen[rows] = self.observe()[rows]
 

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from dq_space_arm_env import DQSpaceArmEnv, SceneError, compile_scene, load_scene
+from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, SceneError, compile_scene, load_scene
+from dq_space_arm_env.environment.disturbances import Disturbances
+from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import draw_initial_state
 from dq_space_arm_env.scene.start import unit_quaternions
 
@@ -29,6 +31,28 @@ def test_the_quaternion_keeps_its_length_and_the_momentum_stays(kernels):
     assert np.abs(np.linalg.norm(states[:, where], axis=1) - 1.0).max() < 1e-15
     drift = kernels.momentum(states[100]) - kernels.momentum(x)
     assert np.abs(drift).max() < 1e-7  # of rk4 in steps of 15 ms
+
+
+def test_pushes_and_noise_leave_the_quaternion_a_rotation(kernels):
+    venv, rng = DQSpaceArmVectorEnv(2, kernels.scene), np.random.default_rng(0)
+    (where,), layout = unit_quaternions(kernels.scene), kernels.layout
+    venv.reset(seed=0)
+    before, increments = venv.states, 0.1 * rng.normal(size=(2, kernels.n_t))
+    increments[1, : layout.tangent.base_velocity.start] = 0.0
+    venv.perturb(increments)
+    np.testing.assert_allclose(np.linalg.norm(venv.states[0, where]), 1.0, rtol=0, atol=1e-15)
+    assert np.abs(venv.states[0, where] - before[0, where]).max() > 0.01
+    np.testing.assert_array_equal(venv.states[1, where], before[1, where])
+    np.testing.assert_allclose(np.linalg.norm(venv.observe()[:, :4], axis=1), 1.0, rtol=0, atol=1e-14)
+    lengths = []
+
+    def act(states, step):
+        lengths.append(np.linalg.norm(states[0, where]))
+        return np.zeros((1, kernels.n_u))
+
+    noise = Disturbances(kernels.scene, rng, measurement=0.1)
+    rollout(StateFeedback(act), kernels.scene, disturbances=noise, steps=3)
+    np.testing.assert_allclose(lengths, 1.0, rtol=0, atol=1e-15)
 
 
 def test_q_and_its_negative_move_alike(kernels):
