@@ -213,6 +213,9 @@ class ShrinkActionSpace(VectorWrapper[Any, Any, Any, Any, Any]):
 class ShapeReward(VectorWrapper[Any, Any, Any, Any, Any]):
     """Shapes rewards for learners, see `agents.wrappers.ShapeReward`; rewards are float32.
 
+    Time steps of a decision are those of the vector `RepeatAction` inside. Single environments of Gymnasium's
+    vector environments that repeat actions have to be in `agents.wrappers.ShapeReward` themselves.
+
     Attributes:
         unshaped: Rewards of the last decisions as the environment inside gave them, shape (num_envs,).
     """
