@@ -53,6 +53,8 @@ from dq_space_arm_env.validation.yaml_text import dump_yaml
 _LARGEST_COST = 1e30  # of one actuator: sums and second derivatives stay finite in single precision too
 _LARGEST_TURN = 0.2  # rad, of a tumbling target in a time step: its attitude then errs by 1e-6 rad a step
 _PLANAR = 'base.motion is "planar"'
+# What joints do there whose z axis is across the plane.
+_OUT_OF_PLANE = {"spherical": "turns", "prismatic": "slides", "screw": "slides"}
 _Location = tuple[str | int, ...]
 _GEOMETRY: Mapping[str, Any] = {"geometry": True}
 _NOT_CONTENT: Any = {  # words and pictures, which change neither motion nor task
@@ -364,8 +366,8 @@ class Scene(Model):
         yield from _inertia_problems(("base", "inertia"), self.base.inertia)
         for index, link in enumerate(self.links):
             here: _Location = ("links", index)
-            if link.is_spherical:
-                sentence = f"{_PLANAR}: a spherical joint turns out of the plane"
+            if leaves := _OUT_OF_PLANE.get(link.joint_type):
+                sentence = f"{_PLANAR}: a {link.joint_type} joint {leaves} out of the plane"
                 yield Problem((*here, "joint_type"), link.joint_type, sentence)
             yield from _pose_problems((*here, "joint"), link.joint)
             yield from _height_problems((*here, "center_of_mass"), link.center_of_mass)

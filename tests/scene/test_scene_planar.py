@@ -13,6 +13,7 @@ Refusals = Callable[[dict[str, Any]], list[str]]
 LEANING = {"axis": [1, 0, 0], "angle": 90}
 TURNED = {"axis": [0, 0, -1], "angle": 30}
 BODY = {"mass": 1, "inertia": [1, 1, 1]}
+SCREW = {**BODY, "name": "drill", "center_of_mass": [0, 0, 0], "joint_type": "screw", "pitch": 0.1}
 SKEW = [[10, 0, 0.1], [0, 11, 0], [0.1, 0, 12]]
 
 REFUSED = [  # path, value, key within it, what the sentence says
@@ -20,6 +21,9 @@ REFUSED = [  # path, value, key within it, what the sentence says
     ("base.inertia", SKEW, "", "Ixz and Iyz must be 0"),
     ("links.0.inertia", [[10, 0, 0], [0, 11, 0.1], [0, 0.1, 12]], "", "Ixz and Iyz must be 0"),
     ("links.0.center_of_mass", [0, 0, 0.1], "", "z component must be 0"),
+    ("links.0.joint_type", "spherical", "", "turns out of the plane"),
+    ("links.0.joint_type", "prismatic", "", "slides out of the plane"),
+    ("links.0", {**SCREW, "joint": {}}, ".joint_type", "slides out of the plane"),
     ("target.base_velocity", [0, 0.1, 0, 0, 0, 0], "", "only wz, vx and vy"),
     ("initial_state.base_velocity", [0, 0, 0, 0, 0, 1], "", "only wz, vx and vy"),
     ("tip_wrench", {"force": [1, 0, 1]}, ".force", "z component must be 0"),
