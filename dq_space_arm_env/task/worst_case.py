@@ -116,8 +116,9 @@ class WorstCase:
         equations, base = self.equations, self.tree.base
         duration = steps * equations.scene.simulation.dt
         reach = self._reach(equations.field.motion(equations.y(x)))
-        if any(link.screw.slide for link in self.tree.links):  # bodies move apart: the tip's by so much
-            fastest = total([speed / casadi.sqrt(body.mass) for body in (base, self.last)])
+        if any(link.screw.slide for link in self.tree.links):  # bodies move apart: those of tips by so much
+            apart = (base, self.last, *(self.bodies[body] for body, _ in self.tree.other_tips))
+            fastest = total([speed / casadi.sqrt(body.mass) for body in apart])
             reach = reach + duration * fastest
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
         gaps = 2.0, 0.5 * (self._apart(x, duration) + duration * drift + 2.0 * reach)

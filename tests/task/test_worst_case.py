@@ -56,6 +56,35 @@ def test_no_motion_costs_more(name):
     assert np.median(bounds / cost) < limit * max(1, len(scene.phases))  # each phase is charged for all steps
 
 
+def test_a_light_body_that_slides_away_costs_no_more_with_a_tip_of_its_own():
+    """A probe of 1 kg, which a constant force pushes from a base of a tonne that carries the main tip."""
+    mass, force, steps = 1.0, 10.0, 100
+    body = {"mass": mass, "inertia": [0.1, 0.1, 0.1], "center_of_mass": [0, 0, 0]}
+    scene = load_scene(
+        {
+            "name": "probe",
+            "base": {"mass": 1000.0, "inertia": [100, 100, 100]},
+            "links": [{**body, "name": "slide", "joint": {}, "joint_type": "prismatic"}],
+            "tip_link": "base",
+            "other_tips": [{"name": "probe", "link": "slide", "goal": {}}],
+            "actuators": {"joint_torque": {"limit": force}},
+            "target": {"pose": {}},
+            "cost": {"pose": 0, "terminal_pose": 0, "joint_torque": 1e-6},
+            "simulation": {"dt": 1.0, "steps": steps},
+        }
+    )
+    equations = SceneEquations.of(scene, [])
+    start, state, cost = equations.layout.initial_state.tolist(), equations.layout.state, 0.0
+    for time in range(steps + 1):
+        x, back = list(start), -force / scene.base.mass  # acceleration of the base
+        x[7] = 0.25 * back * time**2  # half of its position
+        x[state.joint_angles.start] = 0.5 * (force / mass - back) * time**2
+        x[state.base_velocity.stop - 1] = back * time
+        terms = equations.cost_terms(x, [force]) if time < steps else equations.terminal_cost_terms(x)
+        cost += sum(map(float, terms))
+    assert cost < float(worst_cost(equations, [equations], start, steps))
+
+
 def test_a_simulation_that_diverges_pays_more_than_the_true_motion():
     """Constant full actions, which undivided steps of `planar` at 150 ms do not follow."""
     scene = load_scene("planar").replace(simulation={"dt": 0.15, "steps": 400})
