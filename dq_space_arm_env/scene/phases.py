@@ -61,7 +61,9 @@ def _plain(path: str, value: Any) -> Any:
         value = value.tolist()
     if isinstance(value, list | tuple):
         return tuple(_plain(path, entry) for entry in value)
-    if value is None or isinstance(value, bool | int | float | str):
+    if isinstance(value, float):
+        return value + 0.0  # no -0.0: equal scenes have equal content hashes
+    if value is None or isinstance(value, bool | int | str):
         return value
     raise problem(f"{path} must be numbers or null, each by its path, such as links.0.mass")
 

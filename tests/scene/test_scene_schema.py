@@ -303,6 +303,14 @@ class TestContentHash:
         assert Scene.model_validate(data).content_hash() == before
         assert len(before) == 64
 
+    def test_nor_on_the_sign_of_zeros_in_phases(self) -> None:
+        def changed(zero: float) -> Scene:
+            changes = {"cost.pose.0": zero, "target.pose.position": [1.0, zero, 0.5]}
+            return load_scene("paper").replace(phases=[{"name": "a", "steps": 1000, "changes": changes}])
+
+        assert changed(-0.0) == changed(0.0)
+        assert changed(-0.0).content_hash() == changed(0.0).content_hash()
+
 
 @pytest.mark.parametrize("name", ["target", "grasp", "inertial", "tip", "base"])
 def test_no_other_tip_hides_a_frame(name: str) -> None:
