@@ -428,6 +428,8 @@ class Scene(Model):
     def to_yaml(self, path: str | Path | None = None) -> str:
         """Write the scene with defaults, but for parts that it lacks; loading it gives an equal scene.
 
+        Of a target that passes more than some 280 waypoints the text is longer than `load_scene` takes.
+
         Args:
             path: File to write, besides returning the text; nothing is written when None.
 
