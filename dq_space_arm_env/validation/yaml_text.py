@@ -13,6 +13,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer, ComposerError
 from ruamel.yaml.constructor import ConstructorError, SafeConstructor
+from ruamel.yaml.emitter import Emitter
 from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 from ruamel.yaml.events import AliasEvent
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
@@ -33,6 +34,7 @@ NODES = 5_000
 """Largest number of keys and values, aliases written out: a link of a scene has some forty."""
 _DIGITS = 300  # of an integer; with more it has no float
 _LONGEST_PROBLEM = 300  # characters
+_FOLDED = ("\x85", "  ")  # come back as one space where they end a line, but for between double quotes
 
 _HEADER = (
     "# SI units (m, kg, s, N, N m, rad); quaternions are scalar first; poses are position and rotation.\n"
@@ -50,7 +52,10 @@ class _Representer(SafeRepresenter):
             resolver.resolve(ScalarNode, data, (True, False)) == "tag:yaml.org,2002:str"
             for resolver in (VersionedResolver((1, 1)), VersionedResolver((1, 2)))
         )
-        return self.represent_scalar("tag:yaml.org,2002:str", data, style=None if is_text else "'")
+        style = None if is_text else "'"
+        if any(each in data for each in _FOLDED):
+            style = '"'
+        return self.represent_scalar("tag:yaml.org,2002:str", data, style=style)
 
     def represent_number(self, data: float) -> ScalarNode:
         node = self.represent_float(data)
@@ -65,6 +70,13 @@ _Representer.add_representer(float, _Representer.represent_number)
 _Representer.add_representer(
     dict, lambda self, data: self.represent_mapping("tag:yaml.org,2002:map", data, flow_style=False)
 )
+
+
+class _Emitter(Emitter):
+    """Keeps text between double quotes on one line: where it folds behind a tab, a space more comes back."""
+
+    def write_double_quoted(self, text: Any, split: Any = True) -> None:
+        super().write_double_quoted(text, split=False)
 
 
 class _Scanner(Scanner):
@@ -174,7 +186,7 @@ def mapping_at_top(path: object, data: Any) -> dict[str, Any]:
 def dump_yaml(data: dict[str, Any], header: str = _HEADER) -> str:
     """Write plain data as YAML below a comment, lists of numbers on one line; `parse_yaml` reads it back."""
     yaml = _yaml()
-    yaml.Representer = _Representer
+    yaml.Representer, yaml.Emitter = _Representer, _Emitter
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     yaml.default_flow_style = None  # lists of numbers on one line, nothing else
     yaml.width = 120

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dq_space_arm_env.scene import INTEGRATORS, Scene, StateLayout, list_scenes, load_scene
+from dq_space_arm_env.validation import dump_yaml, parse_yaml
 
 numbers = st.floats(-1e3, 1e3)
 positive = st.floats(1e-6, 1e6)
@@ -124,6 +125,12 @@ def test_shipped_scenes(name: str, tmp_path: Path) -> None:
     assert hash(again) == hash(scene)
     assert again.content_hash() == scene.content_hash()
     assert load_scene(json.loads(json.dumps(scene.model_dump(mode="json", exclude_none=True)))) == scene
+
+
+@pytest.mark.parametrize("gap", ["  ", "\t", "\n\t", "\x85", "\u2028", " \ufeff", "\r"])
+def test_descriptions_keep_what_stands_where_lines_end(gap: str) -> None:
+    for text in (gap, *(f"{'x' * size}{gap}one two three" for size in range(60, 130))):
+        assert parse_yaml(dump_yaml({"description": text})) == {"description": text}
 
 
 @pytest.mark.slow
