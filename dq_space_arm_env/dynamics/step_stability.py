@@ -117,4 +117,6 @@ def advice(scene: Scene) -> str | None:
 
 def _may_be_stiff(scene: Scene) -> bool:
     """Whether the integrator for stiff joints takes the scene's."""
-    return INTEGRATORS[STIFF].turns_quaternions or not any(link.is_spherical for link in scene.links)
+    entry = INTEGRATORS[STIFF]
+    turns = entry.turns_quaternions or not any(link.is_spherical for link in scene.links)
+    return turns and (scene.actuators.tank is None or not entry.keeps_momentum)

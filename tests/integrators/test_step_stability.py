@@ -44,3 +44,11 @@ def test_a_scene_gets_the_stiff_method_only_where_it_needs_one():
     assert stable(stiff).simulation.integrator == "rodas4"
     assert stable(stable(stiff)) == stable(stiff)
     assert advice(stable(stiff)) is None
+
+
+def test_the_stiff_method_is_not_advised_where_a_tank_refuses_it():
+    jet = {"position": [-0.5, 0, 0], "direction": [1, 0, 0], "force": 5.0, "specific_impulse": 220.0}
+    actuators = {"base_force": None, "thrusters": [jet], "tank": {"propellant": 3.0}}
+    stiff = sprung("no-wrist", 1e7, 0.0).replace(actuators=actuators)
+    assert "set simulation.dt to" in advice(stiff)
+    assert stable(stiff) == stiff
