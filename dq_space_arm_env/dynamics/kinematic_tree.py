@@ -242,7 +242,7 @@ Places = list[tuple[int, Placement | None]]
 def _bodies(scene: Scene, given: Given) -> tuple[Places, list[RigidBody], list[float]]:
     """Places of base and links; bodies with payloads and what is fixed to them; their nominal masses, kg."""
     places: Places = [(0, None)]
-    bodies, masses = [_rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given)], [scene.base.mass]
+    bodies, masses = [rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given)], [scene.base.mass]
     if scene.actuators.tank is not None:
         masses[0] += scene.actuators.tank.propellant
 
@@ -251,7 +251,7 @@ def _bodies(scene: Scene, given: Given) -> tuple[Places, list[RigidBody], list[f
         masses[body] += nominal
 
     for index, link in enumerate(scene.links):
-        own = _rigid_body(link, f"links.{index}", link.center_of_mass, given)
+        own = rigid_body(link, f"links.{index}", link.center_of_mass, given)
         if link.is_fixed:
             parent, at = places[scene.parent_bodies[index]]
             place = _placement(link.joint).within(at)
@@ -267,7 +267,7 @@ def _bodies(scene: Scene, given: Given) -> tuple[Places, list[RigidBody], list[f
     for carrier, payload, frame, name in held:
         if payload is not None:
             body, at = places[carrier]
-            own = _rigid_body(payload, name, payload.center_of_mass, given)
+            own = rigid_body(payload, name, payload.center_of_mass, given)
             add_to(body, payload.mass, _moved(own, _placement(frame).within(at)))
     return places, bodies, masses
 
@@ -293,7 +293,7 @@ def _links(scene: Scene, given: Given, places: Places, bodies: Sequence[RigidBod
             yield JointedLink(bodies[body], joint, screw, parent, *passive, *drive, spherical)
 
 
-def _rigid_body(body: Base | Link | Payload, place: str, center_of_mass: Vector, given: Given) -> RigidBody:
+def rigid_body(body: Base | Link | Payload, place: str, center_of_mass: Vector, given: Given) -> RigidBody:
     """Mass properties of the body at a place of the scene."""
     return RigidBody(
         given.get(f"{place}.mass", body.mass),

@@ -8,7 +8,7 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.algebra.vectors import norm, subtract
-from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, rigid_body
 from dq_space_arm_env.dynamics.plastic_impact import Velocities, capture, momentum_at_tip
 from dq_space_arm_env.scene.parameters import body_numbers, catch_numbers, velocity_entries
 from dq_space_arm_env.task.equations import SceneEquations
@@ -28,11 +28,12 @@ class Catching:
         assert scene.payload is not None
         self.equations = equations
         own = {number.name for number in body_numbers(scene, "payload")}
-        others = {name: value for name, value in equations.given.items() if name not in own}
-        self._free = KinematicTree.from_scene(scene, others | dict.fromkeys(own, 0.0))
-        self._loaded = KinematicTree.from_scene(scene, others)
-        payload = scene.payload
-        self._payload = RigidBody(payload.mass, payload.center_of_mass, payload.inertia)
+        # Those that phases change are the scene's own once it is held; others may be parameters.
+        unheld = own & scene.staged.values.keys()
+        given = {name: value for name, value in equations.given.items() if name not in unheld}
+        self._free = KinematicTree.from_scene(scene, given | dict.fromkeys(own, 0.0))
+        self._loaded = KinematicTree.from_scene(scene, given)
+        self._payload = rigid_body(scene.payload, "payload", scene.payload.center_of_mass, given)
 
     def __call__(self, x: Scalars, twist: Scalars) -> list[Scalar]:
         """State after the payload, with a twist in tip axes, 6 numbers, has been caught."""

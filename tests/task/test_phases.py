@@ -10,13 +10,17 @@ import pytest
 import dq_space_arm_env
 from dq_space_arm_env import Scene, SceneError, compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.environment.disturbances import with_loads
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.interoperability.pinocchio_twin import pinocchio_model, to_pinocchio
 from dq_space_arm_env.kernels.capture import catch_payload
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.parameters import parameters
 from dq_space_arm_env.scene.phases import phase_scene
+from dq_space_arm_env.task.catching import Catching
+from dq_space_arm_env.task.equations import SceneEquations
 from experts.problems.arm_problem import ArmProblem
 
 ANYWAY = {
@@ -528,3 +532,29 @@ def test_phases_take_numbers_of_numpy() -> None:
 def test_an_entry_of_an_inertia_may_change() -> None:
     changed = SCENES["release"].replace({"phases.1.changes.base.inertia.0.0": 11.0})
     assert changed.staged.values["base.inertia.xx"][1] == 11.0
+
+
+def test_a_catch_takes_the_payload_as_parameters_have_it():
+    """Its center of mass off the plane of the scene's, which no phase changes: the momentum stays."""
+    scene = load_scene("capture-and-detumble").replace(parameters=["payload.center_of_mass"])
+    names = [number.name for number in parameters(scene)]
+    given = dict(zip(names, (number.nominal for number in parameters(scene)), strict=True))
+    given["payload.center_of_mass.y"] = 0.4
+    free = SceneEquations.of(scene, [given[name] for name in names])
+    held = given | {name: values[-1] for name, values in scene.staged.values.items()}
+    loaded = SceneEquations.of(scene, [held[name] for name in names])
+    x, twist = free.layout.initial_state.tolist(), [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+
+    def momentum(equations, state):
+        motion, tree = equations.field.motion(equations.y(state)), equations.tree
+        frames = minimal.link_frames(tree, motion.joint_angles)
+        base = (*motion.angular, *motion.linear)
+        velocities = kinematics.body_velocities(tree, frames, base, motion.joint_rates)
+        return np.array(kinematics.momentum(tree, frames, velocities, ())[0], dtype=float)
+
+    rotation, _ = poses.to_matrix(poses.error_pose(free.base_pose(x), free.tip(x)))
+    center = [held[f"payload.center_of_mass.{axis}"] for axis in "xyz"]
+    brought = held["payload.mass"] * (np.array(twist[3:]) + np.cross(twist[:3], center))
+    before = momentum(free, x) + np.array(rotation, dtype=float) @ brought
+    after = momentum(loaded, Catching(free)(x, twist))
+    np.testing.assert_allclose(after, before, rtol=1e-12)
