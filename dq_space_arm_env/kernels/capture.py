@@ -56,9 +56,10 @@ def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: A
     directions = PLANAR_TWIST if layout.planar else tuple(range(6))
     base = spread(state[where.base_velocity].tolist(), directions, 6)
     tree = KinematicTree.from_scene(free.scene)
+    left = state[where.propellant].tolist()
     after = capture(
-        tree,
-        KinematicTree.from_scene(loaded.scene),
+        tree.with_propellant(left),
+        KinematicTree.from_scene(loaded.scene).with_propellant(left),
         RigidBody(payload.mass, payload.center_of_mass, payload.inertia),
         tree.coordinates(state[where.joint_angles].tolist()),
         Velocities(base[:3], base[3:], state[where.joint_rates].tolist()),

@@ -1,6 +1,7 @@
 """Phases: the environment, the kernels and the solver's rows agree; a catch is a plastic impact."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -534,6 +535,16 @@ def test_an_entry_of_an_inertia_may_change() -> None:
     assert changed.staged.values["base.inertia.xx"][1] == 11.0
 
 
+def momentum(equations, state):
+    """Linear momentum of the robot with what it holds, base axes."""
+    motion, tree = equations.field.motion(equations.y(state)), equations.tree
+    tree = tree.with_propellant(motion.propellant)
+    frames = minimal.link_frames(tree, motion.joint_angles)
+    base = (*motion.angular, *motion.linear)
+    velocities = kinematics.body_velocities(tree, frames, base, motion.joint_rates)
+    return np.array(kinematics.momentum(tree, frames, velocities, ())[0], dtype=float)
+
+
 def test_a_catch_takes_the_payload_as_parameters_have_it():
     """Its center of mass off the plane of the scene's, which no phase changes: the momentum stays."""
     scene = load_scene("capture-and-detumble").replace(parameters=["payload.center_of_mass"])
@@ -545,16 +556,26 @@ def test_a_catch_takes_the_payload_as_parameters_have_it():
     loaded = SceneEquations.of(scene, [held[name] for name in names])
     x, twist = free.layout.initial_state.tolist(), [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
 
-    def momentum(equations, state):
-        motion, tree = equations.field.motion(equations.y(state)), equations.tree
-        frames = minimal.link_frames(tree, motion.joint_angles)
-        base = (*motion.angular, *motion.linear)
-        velocities = kinematics.body_velocities(tree, frames, base, motion.joint_rates)
-        return np.array(kinematics.momentum(tree, frames, velocities, ())[0], dtype=float)
-
     rotation, _ = poses.to_matrix(poses.error_pose(free.base_pose(x), free.tip(x)))
     center = [held[f"payload.center_of_mass.{axis}"] for axis in "xyz"]
     brought = held["payload.mass"] * (np.array(twist[3:]) + np.cross(twist[:3], center))
     before = momentum(free, x) + np.array(rotation, dtype=float) @ brought
     after = momentum(loaded, Catching(free)(x, twist))
     np.testing.assert_allclose(after, before, rtol=1e-12)
+
+
+def test_a_catch_moves_what_is_left_in_the_tank_too():
+    jet = {"position": [-0.5, 0, 0], "direction": [1, 0, 0], "force": 5.0, "specific_impulse": 220.0}
+    actuators = {"base_force": None, "thrusters": [jet], "tank": {"propellant": 30.0}}
+    loaded = load_scene("payload").replace(actuators=actuators)
+    scenes = loaded.replace(payload=None), loaded
+    layouts = [StateLayout.of(scene) for scene in scenes]
+    kernels: Any = [
+        SimpleNamespace(scene=scene, n_x=layout.n_x, layout=layout)
+        for scene, layout in zip(scenes, layouts, strict=True)
+    ]
+    x = layouts[0].initial_state.copy()
+    x[layouts[0].state.base_velocity] = [0.0, 0.1, 0.0, 1.0, 0.0, 0.0]
+    after = catch_payload(*kernels, x, np.zeros(6))
+    free, held = (SceneEquations.of(scene, []) for scene in scenes)
+    np.testing.assert_allclose(momentum(held, after.tolist()), momentum(free, x.tolist()), atol=1e-11)
