@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.shown_text import printable
@@ -20,15 +20,20 @@ SUCCESS, FAILURE, UNUSABLE, INTERNAL, INTERRUPTED = 0, 1, 2, 70, 130
 
 @cache
 def _console_class() -> type[Console]:
-    """A console that shows control characters in what it prints, rather than send them to the terminal."""
+    """A console that shows control characters in what it prints, rather than send them to the terminal.
+
+    Of what its encoding lacks it shows question marks: a degree sign must not cost the results.
+    """
     from rich.console import Console
     from rich.segment import Segment
 
     class PrintableConsole(Console):
         def render(self, *renderable: Any, **options: Any) -> Any:
             for segment in super().render(*renderable, **options):
-                # Rich's own control codes are marked as such.
-                yield segment if segment.control else Segment(printable(segment.text), segment.style)
+                if not segment.control:  # as rich's own control codes are marked
+                    text = _encodable(printable(segment.text), self.file)
+                    segment = Segment(text, segment.style)
+                yield segment
 
     return PrintableConsole
 
@@ -45,11 +50,19 @@ def message_console() -> Console:
     return _console_class()(stderr=True, highlight=False)
 
 
+def _encodable(text: str, stream: IO[str]) -> str:
+    """Text with question marks for what a stream cannot encode and would raise an error for."""
+    encoding = getattr(stream, "encoding", None)
+    if encoding is None or text.isascii() or getattr(stream, "errors", "strict") != "strict":
+        return text
+    return text.encode(encoding, "replace").decode(encoding)
+
+
 def say(sentence: str) -> None:
     """Print a line on standard output."""
     import click
 
-    click.echo(printable(sentence))
+    click.echo(_encodable(printable(sentence), sys.stdout))
 
 
 def print_document(value: Any) -> None:

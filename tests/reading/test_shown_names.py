@@ -2,6 +2,7 @@
 
 import io
 import json
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,7 @@ from dq_space_arm_env.common.console import (
     complain,
     message_console,
     print_document,
+    say,
     table_console,
 )
 from dq_space_arm_env.common.results import Destination
@@ -67,6 +69,15 @@ def test_consoles_escape_what_they_print(capsys: pytest.CaptureFixture[str]) -> 
         assert "\x1b" not in said
         assert "\x9b" not in said
         assert SHOWN in said
+
+
+def test_what_a_stream_cannot_encode_is_a_question_mark(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, "ascii"))
+    table_console().print(Text("3° off, größe"))
+    say("5 µs")
+    sys.stdout.flush()
+    assert written.getvalue().decode().splitlines() == ["3? off, gr??e", "5 ?s"]
 
 
 def test_documents_escape_what_json_does_not(
