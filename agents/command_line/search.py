@@ -88,13 +88,6 @@ def search(
         found = hyperparameter_search.search(
             checked, varied, trials, out, prune=pruning, executor=executor, report=shown.update
         )
-    console = written.console(150)
-    console.print(_table(found.trials, varied).for_terminal())
-    for row in found.trials:
-        if "failure" in row:
-            complain(f"trial {row['trial']}: {row['failure']}", label="Failed: ")
-    if found.best is not None:
-        console.print(f"Best: trial {found.best['trial']}, {found.file}", markup=False, soft_wrap=True)
     content = {
         "trials": found.trials,
         "best": None if found.best is None else found.best["trial"],
@@ -104,7 +97,18 @@ def search(
     }
     drawable = any(row["median_cost"] is not None for row in found.trials)
     draw = (lambda: _picture(found.trials, varied)) if drawable else None
-    written.save(console, "search", json_value(content), draw)
+    record = json_value(content)
+    lines = written.write("search", record, draw)
+    console = written.console(150)
+    console.print(_table(found.trials, varied).for_terminal())
+    for row in found.trials:
+        if "failure" in row:
+            complain(f"trial {row['trial']}: {row['failure']}", label="Failed: ")
+    if found.best is not None:
+        console.print(f"Best: trial {found.best['trial']}, {found.file}", markup=False, soft_wrap=True)
+    for line in lines:
+        console.print(line, markup=False)
+    written.print(record)
     return FAILURE if found.best is None else SUCCESS
 
 

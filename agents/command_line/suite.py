@@ -111,11 +111,12 @@ def suite(
     ):
         run = run_suite(entrants, version, out=out, trust=trust, progress=shown.update, **chosen)
     page, console = suite_page(run, picture=picture), written.console(150)
+    files = page.save(out, "suite")
     for section in page.sections:
         section.print(console)
     for sentence in page.shortcomings:
         console.print(sentence, markup=False)
-    console.print(f"{out}: {', '.join(page.save(out, 'suite'))}", markup=False)
+    console.print(f"{out}: {', '.join(files)}", markup=False)
     rows = [] if other is None else check(run, other)
     if rows:
         console.print(tabulate(f"Beside {other}", rows, check_columns()).for_terminal())

@@ -146,12 +146,15 @@ def _train_several(
         )
     summaries = [*many_trainings.seed_summaries(rows)]
     destination = Destination(folder, picture=False, document=as_json)
+    record: dict[str, Any] = json_value({"runs": rows, "seeds": summaries, **provenance()})
+    written = destination.write("runs", record, None)
     console = destination.console()
     console.print(many_trainings.trainings_table(rows).for_terminal())
     if summaries:
         console.print(many_trainings.seeds_table(summaries).for_terminal())
-    record: dict[str, Any] = {"runs": rows, "seeds": summaries, **provenance()}
-    destination.save(console, "runs", json_value(record), None)
+    for line in written:
+        console.print(line, markup=False)
+    destination.print(record)
     failed = [row for row in rows if row["outcome"] == "failed"]
     for row in failed:
         complain(f"{row['agent']}, seed {row['seed']}: {row['failure']}", label="Failed: ")

@@ -67,10 +67,6 @@ def run(destination: Destination, options: Options) -> None:
         effort = Effort(counts, options.seeds, options.updates)
         trainings = measure(configuration, effort, demonstrations, tests, folder, shown.update)
     measured = points(trainings)
-    title = f"Cloning: {effort.updates} updates, flights from {len(tests)} starts"
-    console.print(tabulate(title, measured, _columns()).for_terminal())
-    for sentence in _verdict(measured):
-        console.print(sentence, markup=False, soft_wrap=True)
     record = {
         "configuration": configuration.model_dump(mode="json", exclude_none=True),
         "effort": asdict(effort),
@@ -78,7 +74,14 @@ def run(destination: Destination, options: Options) -> None:
         "trainings": trainings,
         **provenance("torch"),
     }
-    destination.save(console, "cloning", record, lambda: _picture(measured))
+    written = destination.write("cloning", record, lambda: _picture(measured))
+    title = f"Cloning: {effort.updates} updates, flights from {len(tests)} starts"
+    console.print(tabulate(title, measured, _columns()).for_terminal())
+    for sentence in _verdict(measured):
+        console.print(sentence, markup=False, soft_wrap=True)
+    for line in written:
+        console.print(line, markup=False)
+    destination.print(record)
 
 
 def _data(

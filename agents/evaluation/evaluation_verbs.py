@@ -95,14 +95,15 @@ def evaluate_policies(
                     out.mkdir(parents=True, exist_ok=True)
                     write_atomically(out / (re.sub(r"[^\w.-]+", "-", name) + ".json"), content + "\n")
         summaries += [evaluation.summary() for evaluation in evaluations]
-        console.print(evaluation_table(evaluations).for_terminal())
-        if together := groups(evaluations):
-            console.print(groups_table(together).for_terminal())
-        for sentence in (*remarks(evaluations), *pairs(evaluations)):
-            console.print(sentence, markup=False)
+        together = groups(evaluations)
         if out is not None and together:
             seeds = {"groups": [group_record(group) for group in together], "provenance": provenance()}
             write_atomically(out / f"seeds-{condition}.json", json.dumps(seeds) + "\n")
+        console.print(evaluation_table(evaluations).for_terminal())
+        if together:
+            console.print(groups_table(together).for_terminal())
+        for sentence in (*remarks(evaluations), *pairs(evaluations)):
+            console.print(sentence, markup=False)
     return summaries
 
 
@@ -151,7 +152,10 @@ def save_comparison(
     found: Comparison,
     draw: Callable[[], bytes],
 ) -> None:
-    """Print a comparison, and write it as Markdown, as JSON, and as a picture."""
+    """Write a comparison as Markdown, as JSON, and as a picture, and print it."""
+    content = {**record(found), **provenance()}
+    write_atomically(destination.folder / "table.md", markdown(title, tables, found))
+    written = destination.write("comparison", content, draw)
     console = destination.console(180)
     for table in tables:
         console.print(table.for_terminal())
@@ -160,5 +164,6 @@ def save_comparison(
     console.print("Commands that reproduce the rows:")
     for command in found.commands:
         console.print(f"  {command}", markup=False, soft_wrap=True)
-    write_atomically(destination.folder / "table.md", markdown(title, tables, found))
-    destination.save(console, "comparison", {**record(found), **provenance()}, draw)
+    for line in written:
+        console.print(line, markup=False)
+    destination.print(content)

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-
-from rich.console import Console
+from typing import Any
 
 from agents.evaluation.beside_expert import SideBySide, fly_beside_expert
 from agents.zoo.finding import as_policy, scene_of
@@ -36,7 +35,7 @@ def show(
     trust: bool = False,
     normalize: Path | None = None,
 ) -> bool:
-    """Fly, print a table, write record and pictures; whether the agent reaches the target in all flights.
+    """Fly, write record and pictures, print a table; whether the agent reaches the target in all flights.
 
     The scene is the policy's by default. Flights after the first start at consecutive seeds.
     """
@@ -46,16 +45,20 @@ def show(
         raise ValueError(f"--seed: {seed}, should be at least 0")
     if gif is not None and find_spec("PIL") is None:
         raise ModuleNotFoundError('--gif: needs Pillow: pip install "dq-space-arm[plots]"')
-    console, acting = destination.console(120), as_policy(policy, trust=trust, normalize=normalize)
+    acting = as_policy(policy, trust=trust, normalize=normalize)
     flown = load_scene(scene or scene_of([acting]))
     first = 0 if seed is None else seed + 1
     pairs = fly_beside_expert(acting, flown, [seed, *range(first, first + n - 1)])
+    record = {"flights": [pair.record() for pair in pairs], **provenance()}
+    written, console = _save(destination, record, gif, pairs), destination.console(120)
     console.print(_table(pairs).for_terminal())
     if n == 1:
         verb = "reaches" if pairs[0].agent.is_success else "does NOT reach"
         gap = f"its cost gap is {100.0 * pairs[0].cost_gap:.2f} %."
         console.print(f"{pairs[0].agent.name} {verb} the target; {gap}", markup=False)
-    _save(console, destination, gif, pairs)
+    for line in written:
+        console.print(line, markup=False)
+    destination.print(record)
     return all(pair.agent.is_success for pair in pairs)
 
 
@@ -89,14 +92,16 @@ def _table(pairs: Sequence[SideBySide]) -> TextTable:
     return tabulate(f"Scene {scene.name}; tolerance {named}", rows, columns)
 
 
-def _save(console: Console, destination: Destination, gif: Path | None, pairs: Sequence[SideBySide]) -> None:
+def _save(
+    destination: Destination, record: dict[str, Any], gif: Path | None, pairs: Sequence[SideBySide]
+) -> list[str]:
+    """Write record and pictures; lines that name the files."""
     folder = destination.folder
     folder.mkdir(parents=True, exist_ok=True)
-    files = ["flight.json"]
-    record = {"flights": [pair.record() for pair in pairs], **provenance()}
+    files, lines = ["flight.json"], []
     write_atomically(folder / files[0], to_json(record))
     if destination.picture and find_spec("matplotlib") is None:
-        console.print(NO_PICTURE, markup=False)
+        lines.append(NO_PICTURE)
     elif destination.picture:
         from agents.evaluation.beside_expert_figure import errors_figure, inputs_figure
         from experts.figures.style import as_png
@@ -108,8 +113,7 @@ def _save(console: Console, destination: Destination, gif: Path | None, pairs: S
         gif.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(gif, _animation(pairs[0].agent.maneuver))
         files.append(str(gif))
-    console.print(f"{folder}: {', '.join(files)}", markup=False)
-    destination.print(record)
+    return [*lines, f"{folder}: {', '.join(files)}"]
 
 
 def _animation(maneuver: Maneuver) -> bytes:

@@ -25,20 +25,20 @@ class Destination:
         """Make the console for tables."""
         return table_console(width, stderr=self.document)
 
-    def save(
-        self, console: Console, name: str, record: dict[str, Any], draw: Callable[[], bytes] | None
-    ) -> None:
-        """Write a record as JSON, draw its picture as PNG, and print the names of the files."""
-        files = [f"{name}.json"]
+    def write(self, name: str, record: dict[str, Any], draw: Callable[[], bytes] | None) -> list[str]:
+        """Write a record as JSON, and draw its picture as PNG; lines that name the files.
+
+        Write before anything is printed: nobody may be there to read it.
+        """
+        files, lines = [f"{name}.json"], []
         write_atomically(self.folder / files[0], to_json(record))
         if draw is not None and self.picture:
             if find_spec("matplotlib") is None:
-                console.print(NO_PICTURE, markup=False)
+                lines.append(NO_PICTURE)
             else:
                 files.append(f"{name}.png")
                 write_atomically(self.folder / files[1], draw())
-        console.print(f"{self.folder}: {', '.join(files)}", markup=False)
-        self.print(record)
+        return [*lines, f"{self.folder}: {', '.join(files)}"]
 
     def print(self, record: dict[str, Any]) -> None:
         """Print the document, if one is wanted."""

@@ -185,7 +185,6 @@ def collect(benchmark: Benchmark, effort: Effort, console: Console) -> tuple[lis
                 labels = [row[key] for key in ("group", "scene", "name", "subject") if row.get(key)]
                 status.update(f"Measuring: {benchmark.name}: {row['table']} {', '.join(map(str, labels))}")
         except KeyboardInterrupt:
-            console.print("Interrupted: the measurements so far are saved.")
             return rows, True
         except Exception as error:
             if not rows:
@@ -219,12 +218,13 @@ def run(benchmarks: Sequence[Benchmark], effort: Effort, folder: Path, console: 
         started = perf_counter()
         rows, interrupted = collect(benchmark, effort, console)
         page.sections.append(section_of(benchmark, rows, effort))
-        page.sections[-1].print(console)
         record = {**page.sections[-1].record, **page.origin}
         write_atomically(folder / f"{benchmark.name.replace('-', '_')}.json", to_json(json_value(record)))
         page.save(folder)
+        page.sections[-1].print(console)  # last: nobody may be there to read it
         console.print(f"{benchmark.title}: {perf_counter() - started:.0f} s", markup=False)
         if interrupted:
+            console.print("Interrupted: the measurements so far are saved.")
             return INTERRUPTED
     console.print(f"{folder}: report.html, report.md, and JSON of each benchmark", markup=False)
     for sentence in page.shortcomings:

@@ -1,8 +1,10 @@
 """A small scene whose problems are solved in hundredths of a second, and demonstrations of it."""
 
+import errno
+import io
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -34,6 +36,21 @@ def run_without():
         return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
 
     return run
+
+
+class FullDisk(io.StringIO):
+    """Output to a disk without room."""
+
+    def write(self, text: str) -> int:
+        if text:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return 0
+
+
+@pytest.fixture
+def fill_output(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """A function, to be called in the test itself, after which nothing can be printed."""
+    return lambda: monkeypatch.setattr("sys.stdout", FullDisk())
 
 
 @pytest.fixture(scope="session")

@@ -85,6 +85,24 @@ def test_files_and_exit_status(
     assert "Made up" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+class Unread(StringIO):
+    """Output that nobody reads any more."""
+
+    def write(self, text: str) -> int:
+        if text:
+            raise BrokenPipeError
+        return 0
+
+
+@pytest.mark.parametrize("ends", [None, KeyboardInterrupt()])
+def test_what_nobody_reads_is_measured_all_the_same(tmp_path: Path, ends: BaseException | None) -> None:
+    with pytest.raises((SystemExit, BrokenPipeError)):
+        run([benchmark(ROWS, ends=ends)], QUICK, tmp_path, Console(file=Unread(), width=120))
+    found = json.loads((tmp_path / "made_up.json").read_text(encoding="utf-8"))
+    assert found["rows"] == json_value(ROWS)
+    assert "Made up" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
 def test_settings_override_the_effort() -> None:
     changed = STANDARD.changed(
         ("starts=3", "only=[masses, poses]", "scenes=payload", "duration=2", "peers=false")

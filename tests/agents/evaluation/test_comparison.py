@@ -342,6 +342,15 @@ def test_the_verb_writes_table_record_and_picture(tmp_path, capsys, quick):
     assert [row["policy"] for row in rows] == ["plan with gains", "stub-0"]
 
 
+def test_files_are_written_where_nothing_can_be_printed(tmp_path, quick, fill_output):
+    fill_output()
+    quick.to_yaml(tmp_path / "quick.yaml")
+    out = tmp_path / "out"
+    words = ["--scene", str(tmp_path / "quick.yaml"), "-n", "3", "--workers", "1", "--no-picture"]
+    assert main(["compare", *words, "--controller", "gains", "--out", str(out)]) == 1
+    assert {path.name for path in out.iterdir()} == {"rows", "table.md", "comparison.json"}
+
+
 def test_the_verb_refuses_a_policy_before_it_begins(tmp_path, capsys, quick):
     out = ["--out", str(tmp_path / "out")]
     assert main(["compare", "--policy", str(tmp_path / "nothing"), *out]) == 2

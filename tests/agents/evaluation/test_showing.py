@@ -125,6 +125,13 @@ def test_the_verb_writes_numbers_and_pictures(exported, tmp_path, capsys):
     assert "-n: 0, should be at least 1" in capsys.readouterr().err
 
 
+def test_files_are_written_where_nothing_can_be_printed(exported, tmp_path, fill_output):
+    fill_output()
+    out = tmp_path / "out"
+    assert main(["evaluate", "show", str(exported), "--no-picture", "--out", str(out)]) == 1
+    assert len(json.loads((out / "flight.json").read_text())["flights"]) == 1
+
+
 @pytest.mark.slow
 def test_the_verb_draws_the_flight(exported, tmp_path):
     image = pytest.importorskip("PIL.Image")

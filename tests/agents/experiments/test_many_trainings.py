@@ -6,6 +6,7 @@ import shutil
 import signal
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,15 @@ def test_one_failure_is_a_row_and_the_others_are_trained(
     assert [row for row in document["runs"] if row["seed"] in (0, 3)] == [
         row for row in runs["runs"] if row["seed"] in (0, 3)
     ]
+
+
+def test_runs_are_written_where_nothing_can_be_printed(
+    configuration_file: Path, tmp_path: Path, fill_output: Callable[[], None]
+) -> None:
+    fill_output()
+    words = [str(configuration_file), "--seeds", "1", "--workers", "1", "--out", str(tmp_path / "runs")]
+    assert main(["train", *words]) == FAILURE
+    assert len(json.loads((tmp_path / "runs" / "runs.json").read_text())["runs"]) == 1
 
 
 @pytest.mark.slow
