@@ -92,6 +92,13 @@ def test_the_reference_is_more_precise_than_what_it_judges(precision: dict) -> N
     assert precision["reference"][0]["duration_s"] == pytest.approx(3.0)
 
 
+def test_no_error_is_below_the_uncertainty_of_the_reference(precision: dict) -> None:
+    """The method of order 8 in the steps of the reference would have no error at all."""
+    uncertainty = precision["reference"][0]["uncertainty"]
+    least = min(point["error"] for point in precision["points"] if point["error"] is not None)
+    assert least == uncertainty > 0.0
+
+
 def test_stiff_joints_get_a_stiff_reference(short_scene: Scene) -> None:
     (link,) = short_scene.links
     stiff = short_scene.replace(links=[link.model_copy(update={"stiffness": 1e9})])
