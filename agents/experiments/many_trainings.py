@@ -17,7 +17,7 @@ from agents.evaluation.comparison_tables import COLUMNS
 from agents.evaluation.statistics import interquartile_mean
 from agents.experiments.shared_demonstrations import SharedDemonstrations
 from agents.experiments.training_task import FAILED, TRAINED, TrainingTask
-from agents.training import default_folder, with_changes
+from agents.training import default_folder, is_trained, with_changes
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.host_machine import processors
 from dq_space_arm_env.common.progress import Advance, Status
@@ -39,12 +39,14 @@ class Overview:
     """How far many trainings have come, from what each notes in its folder."""
 
     def __init__(self, total: int, name: str = "trainings", found: int = 0) -> None:
-        self._total, self._name, self._found = total, name, found
+        self._total, self._name = total, name
+        self._found = float(found)  # trainings, and parts of some, that earlier calls have done
         self._under_way: dict[str, TrainingTask] = {}
         self._done, self._failed, self._begun, self._line = found, 0, perf_counter(), ""
 
     def begin(self, task: TrainingTask) -> None:
         """Watch a training from now on."""
+        self._found += 1.0 if is_trained(task.configuration, task.folder) else _share(task.progress())
         self._line, self._under_way[str(task.folder)] = "", task
 
     def end(self, row: Row) -> None:
@@ -65,7 +67,7 @@ class Overview:
     def status(self) -> Status:
         """The progress of all of them together."""
         under_way = [(task.label, task.progress()) for task in list(self._under_way.values())]
-        shares = [min(each.done / max(each.total, 1), 1.0) for _, each in under_way]
+        shares = [_share(each) for _, each in under_way]
         share = min((self._done + sum(shares)) / self._total, 1.0)
         line = f"{self._done} of {self._total} {self._name}, {share:.0%}"
         if self._failed:
@@ -80,6 +82,11 @@ class Overview:
             label, first = under_way[0]
             line += f"; {label}: {first.line}"
         return Status(int(_PARTS * share), _PARTS, line)
+
+
+def _share(status: Status) -> float:
+    """Share of a training that is done."""
+    return min(status.done / max(status.total, 1), 1.0)
 
 
 def run_trainings(

@@ -223,6 +223,30 @@ def test_progress_is_that_of_all(configuration: AgentConfiguration, tmp_path: Pa
     assert "1 of 4 trainings, 25%, 1 failed" in overview.status().line
 
 
+def test_the_time_left_does_not_count_what_earlier_calls_have_done(
+    configuration: AgentConfiguration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One training of four was finished before, another came half way; an eighth of all took ten seconds."""
+    clock = [0.0]
+    monkeypatch.setattr("agents.experiments.many_trainings.perf_counter", lambda: clock[0])
+    finished, begun = (
+        training_task(configuration.model_copy(update={"seed": seed}), tmp_path) for seed in (0, 1)
+    )
+    finished.folder.mkdir()
+    assert finished.run()["outcome"] == "trained"
+    begun.folder.mkdir()
+    progress = begun.folder / PROGRESS
+    progress.write_text(json.dumps({"done": 30, "total": 60, "line": ""}))
+    overview = Overview(4)
+    overview.begin(finished)
+    overview.end({"folder": str(finished.folder), "outcome": "trained"})
+    overview.begin(begun)
+    clock[0] = 10.0
+    assert "left" not in overview.status().line  # nothing is done in this call
+    progress.write_text(json.dumps({"done": 60, "total": 60, "line": ""}))
+    assert "50%, about 0:00:40 left" in overview.status().line
+
+
 def test_seeds_are_summarized_without_failures() -> None:
     rows = [
         {"agent": "a", "outcome": "trained", "success_rate": rate, "median_cost": cost, "seconds": 2.0}
