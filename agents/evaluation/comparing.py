@@ -178,7 +178,7 @@ def compare(
     check_sequences(policies=policies, controllers=controllers, conditions=conditions)
     _check("controllers", controllers, tuple(CONTROLLERS))
     _check("conditions", conditions, CONDITIONS)
-    conditions = tuple(dict.fromkeys(conditions))
+    controllers, conditions = tuple(dict.fromkeys(controllers)), tuple(dict.fromkeys(conditions))
     given = load_scene(scene)
     for condition in conditions:
         scene_under(given, condition)  # refuses one that the scene cannot have, before hours of work

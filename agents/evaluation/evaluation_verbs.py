@@ -120,7 +120,9 @@ def compare_controllers(
     trust: bool = False,
     normalize: Path | None = None,
 ) -> None:
-    """Compare, print the tables, and write the files; finished rows are read from the folder."""
+    """Compare, write the files, and print the tables; finished rows are read from the folder."""
+    if NONE in controllers and set(controllers) != {NONE}:
+        raise ValueError(f"--controller: {' '.join(controllers)}, should be {NONE} alone, or controllers")
     with progress_bar() as show:
         found = compare(
             policies,

@@ -102,7 +102,7 @@ def compare_under_mismatch(
     )
     controllers = _controllers(scene, found, receding_horizon, receding_starts)
     rows: list[Row] = []
-    for condition in conditions:
+    for condition in dict.fromkeys(conditions):
         optimal = informed_costs(
             scene,
             demonstrations,
@@ -329,7 +329,7 @@ def compare_corrections(
         )
     words = [
         *("dq-space-arm", "compare", "residual", *policies, "--scene", scene, "-n", str(n)),
-        *("--condition", *conditions, "--tolerance-scale", f"{tolerance_scale:g}"),
+        *("--condition", *dict.fromkeys(conditions), "--tolerance-scale", f"{tolerance_scale:g}"),
         *("--receding-starts", str(receding_starts)),
     ]
     trained = (training_command(policy.metadata, file) for policy, file in corrections.values())

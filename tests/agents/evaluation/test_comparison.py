@@ -342,6 +342,14 @@ def test_the_verb_writes_table_record_and_picture(tmp_path, capsys, quick):
     assert [row["policy"] for row in rows] == ["plan with gains", "stub-0"]
 
 
+def test_a_controller_named_twice_is_flown_once_and_none_stands_alone(tmp_path, capsys, quick):
+    found = compare(scene=quick, n=2, controllers=["gains", "gains"], executor=SerialExecutor())
+    assert [row.name for row in found.rows] == ["plan with gains"]
+    words = ["compare", "apg", "--workers", "1", "--out", str(tmp_path / "out")]
+    assert main([*words, "--controller", "none", "gains"]) == 2
+    assert "--controller: none gains, should be none alone" in capsys.readouterr().err
+
+
 def test_files_are_written_where_nothing_can_be_printed(tmp_path, quick, fill_output):
     fill_output()
     quick.to_yaml(tmp_path / "quick.yaml")

@@ -237,6 +237,8 @@ def test_finished_rows_are_taken_up(small_scene, demonstrations, tmp_path, monke
     monkeypatch.setattr("agents.residual.informed.BoxDDP", refuse)
     again = compare_under_mismatch([run], few, **arguments)
     assert json.dumps(record(again)) == json.dumps(record(first))
+    twice = compare_under_mismatch([run], few, **arguments | {"conditions": [PLANNED, TESTED, PLANNED]})
+    assert len(twice.rows) == len(first.rows)
     other = write_correction(tmp_path / "other" / RUN, small_scene, 0.01)
     changed = (
         ([run], few, {"seed": 1}),
