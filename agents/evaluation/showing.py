@@ -22,6 +22,7 @@ from experts.maneuver import Maneuver
 
 _FRAMES_PER_SECOND = 20.0
 _HOLD = 2.0  # s, of the last picture
+_PICTURES = ("errors.png", "inputs.png")
 
 
 def show(
@@ -100,15 +101,17 @@ def _save(
     folder.mkdir(parents=True, exist_ok=True)
     files, lines = ["flight.json"], []
     write_atomically(folder / files[0], to_json(record))
-    if destination.picture and find_spec("matplotlib") is None:
-        lines.append(NO_PICTURE)
-    elif destination.picture:
+    if destination.picture and find_spec("matplotlib") is not None:
         from agents.evaluation.beside_expert_figure import errors_figure, inputs_figure
         from experts.figures.style import as_png
 
-        for name, make in (("errors.png", errors_figure), ("inputs.png", inputs_figure)):
+        for name, make in zip(_PICTURES, (errors_figure, inputs_figure), strict=True):
             write_atomically(folder / name, as_png(partial(make, pairs[0])))
             files.append(name)
+    else:
+        for name in _PICTURES:
+            (folder / name).unlink(missing_ok=True)  # of an earlier run: it may show another flight
+        lines += [NO_PICTURE] if destination.picture else []
     if gif is not None:
         gif.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(gif, _animation(pairs[0].agent.maneuver))

@@ -30,14 +30,15 @@ class Destination:
 
         Write before anything is printed: nobody may be there to read it.
         """
-        files, lines = [f"{name}.json"], []
+        files, lines, picture = [f"{name}.json"], [], self.folder / f"{name}.png"
         write_atomically(self.folder / files[0], to_json(record))
-        if draw is not None and self.picture:
-            if find_spec("matplotlib") is None:
-                lines.append(NO_PICTURE)
-            else:
-                files.append(f"{name}.png")
-                write_atomically(self.folder / files[1], draw())
+        drawable = find_spec("matplotlib") is not None
+        if draw is not None and self.picture and drawable:
+            files.append(picture.name)
+            write_atomically(picture, draw())
+        elif draw is not None:
+            picture.unlink(missing_ok=True)  # of an earlier run: it may show other results
+            lines += [NO_PICTURE] if self.picture else []
         return [*lines, f"{self.folder}: {', '.join(files)}"]
 
     def print(self, record: dict[str, Any]) -> None:

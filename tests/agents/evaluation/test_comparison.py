@@ -340,6 +340,8 @@ def test_the_verb_writes_table_record_and_picture(tmp_path, capsys, quick):
     assert (out / "comparison.png").read_bytes()[:4] == b"\x89PNG"
     rows = json.loads((out / "comparison.json").read_text())["rows"]
     assert [row["policy"] for row in rows] == ["plan with gains", "stub-0"]
+    assert main(["compare", *arguments, "--controller", "none", "--no-picture", "--out", str(out)]) == 0
+    assert not (out / "comparison.png").exists()  # it had one more row
 
 
 def test_a_controller_named_twice_is_flown_once_and_none_stands_alone(tmp_path, capsys, quick):

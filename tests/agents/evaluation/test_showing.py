@@ -121,6 +121,9 @@ def test_the_verb_writes_numbers_and_pictures(exported, tmp_path, capsys):
     assert [flight["seed"] for flight in flights] == [None, 0]
     assert flights[0]["expert"]["is_success"]
     assert flights[0]["cost_gap"] > 0.0
+    words = ["evaluate", "show", str(exported), "--seed", "3", "--no-picture", "--out", str(out)]
+    assert main(words) == 1
+    assert {path.name for path in out.iterdir()} == {"flight.json"}  # the pictures showed another flight
     assert main(["evaluate", "show", "--policy", str(exported), "-n", "0", "--out", str(out)]) == 2
     assert "-n: 0, should be at least 1" in capsys.readouterr().err
 
