@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -196,10 +197,11 @@ def evaluation_plans(
     evaluation_seeds(scene, n)  # the seeds that RESERVED_SEED gives; refuses a wrong n
     if not 0.0 < tolerance_scale <= 1.0:
         raise ValueError(f"tolerance_scale: {tolerance_scale}, should be above 0, and 1 at most")
+    name = re.sub(r"[/\\]+", "-", scene.name)  # any text may name a scene
     plans = generate_demonstrations(
         stricter(scene, tolerance_scale),
         n,
-        out / f"plans-{scene.name}-{n}-{tolerance_scale:g}",
+        out / f"plans-{name}-{n}-{tolerance_scale:g}",
         RESERVED_SEED,
         executor=executor,
         progress=lambda advance: progress(Advance("plans", advance.done, advance.problems)),

@@ -24,7 +24,12 @@ from agents.residual.corrections import (
     correction_settings,
 )
 from agents.residual.mismatch import Condition, Worlds, fly_mismatched
-from agents.residual.mismatch_comparison import compare_under_mismatch, read_corrections, typical_seconds
+from agents.residual.mismatch_comparison import (
+    compare_under_mismatch,
+    evaluation_plans,
+    read_corrections,
+    typical_seconds,
+)
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.common.console import UNUSABLE
@@ -265,6 +270,17 @@ def test_rows_that_were_interrupted_go_on(small_scene, demonstrations, tmp_path)
     stages = []
     compare_under_mismatch([], demonstrations[:4], progress=lambda a: stages.append(a.stage), **arguments)
     assert set(stages) == {f"as-planned: {FEEDBACK}"}
+
+
+def test_plans_stay_in_the_folder_whatever_the_name_of_the_scene(small_scene, tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        "agents.residual.mismatch_comparison.generate_demonstrations",
+        lambda scene, n, out, *settings, **options: made.append(out) or ["plan"],
+    )
+    evaluation_plans(small_scene.replace(name="a/../../b"), tmp_path, 2)
+    evaluation_plans(small_scene, tmp_path, 2)
+    assert made == [tmp_path / "plans-a-..-..-b-2-0.7", tmp_path / "plans-small-2-0.7"]
 
 
 def test_the_table_says_what_it_shows(comparison):
