@@ -153,7 +153,7 @@ def _draw_training_costs(axes: Axes, rows: Sequence[Row], looks: Looks) -> None:
         end = _excess(_median_ratio(row))
         _draw_training(axes, row, known, end, looks)
         if (seconds := _training_seconds(row)) is not None:
-            _draw_gap(axes, seconds, Interval(*3 * [end / 100.0]), looks[row.name])
+            _draw_gap(axes, max(seconds, 1.0), Interval(*3 * [end / 100.0]), looks[row.name])
     _logarithmic_gaps(axes)
     axes.set_ylabel("median cost above\nmedian optimum [%]", fontsize=8.5)
     _set_training_axis(axes, rows)
@@ -171,7 +171,7 @@ def _draw_training_rates(axes: Axes, rows: Sequence[Row], looks: Looks) -> None:
         rate = row.evaluation.success_rate
         _draw_training(axes, row, rates, 100.0 * rate.value, looks)
         if (seconds := _training_seconds(row)) is not None:
-            _draw_rate(axes, seconds, rate, looks[row.name])
+            _draw_rate(axes, max(seconds, 1.0), rate, looks[row.name])
     _rates(axes)
     _set_training_axis(axes, rows)
 
@@ -253,7 +253,7 @@ def _set_training_axis(axes: Axes, rows: Sequence[Row]) -> None:
     while len(marks) > 2 and marks[-2] >= 1.1 * max(times):
         del marks[-1]
     axes.set_xscale("log")
-    axes.set_xlim(marks[0], marks[-1])
+    axes.set_xlim(marks[0], max(marks[-1], 1.1 * max(times)))
     axes.xaxis.set_major_locator(FixedLocator(marks))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FixedFormatter([_ROUND_TIMES[mark] for mark in marks]))

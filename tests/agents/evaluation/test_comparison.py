@@ -406,6 +406,20 @@ def test_learning_curves_end_in_their_markers(comparison):
     assert curve.get_ydata()[0] == pytest.approx(max(shown, 0.01))
 
 
+@pytest.mark.parametrize("seconds", [0.4, 90.0, 60.0 * 3600.0])
+def test_trainings_of_any_length_are_within_the_axes(comparison, seconds, monkeypatch):
+    pytest.importorskip("matplotlib")
+    from agents.evaluation import comparison_figure
+
+    monkeypatch.setattr(comparison_figure, "_training_seconds", lambda row: seconds)
+    figure = comparison_figure.comparison_figure(comparison)
+    for axes in figure.subfigs[1].axes:
+        low, high = axes.get_xlim()
+        markers = [line for line in axes.lines if line.get_marker() not in ("None", None)]
+        assert markers
+        assert all(low <= line.get_xdata()[0] <= high for line in markers)
+
+
 def test_points_of_a_curve_that_are_no_numbers_are_passed_over(tmp_path):
     points = [
         {"seconds": 1.0, "success_rate": 0.5, "median_cost": math.inf},
