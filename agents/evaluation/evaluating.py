@@ -21,7 +21,7 @@ from agents.evaluation.expert_costs import (
     evaluation_seeds,
     optimal_costs,
 )
-from agents.evaluation.statistics import Interval, bootstrap_interval, wilson_interval
+from agents.evaluation.statistics import Interval, bootstrap_interval, rate_over_runs, wilson_interval
 from agents.policies.flying import Flights, Policy, fly, from_json_list, json_list, time_per_action
 from agents.policies.policy_files import noted_effort
 from agents.zoo.finding import as_policy, check_fit
@@ -129,11 +129,14 @@ class Evaluation:
 
     @cached_property
     def constraint_violations(self) -> Interval:
-        """Share of the steps that violate constraints, mean over episodes, with a bootstrap interval."""
+        """Share of the steps that violate constraints, mean over episodes; NaN where that is unknown.
+
+        Its interval is that of a rate: a bootstrap of a few violating flights, or of none, covers too little.
+        """
         shares = self.flights.constraint_violations
-        return bootstrap_interval(
-            shares if np.isfinite(shares).all() else (), lambda drawn: float(np.mean(drawn))
-        )
+        if not np.isfinite(shares).all():
+            return Interval(np.nan, np.nan, np.nan)
+        return rate_over_runs([shares])
 
     @property
     def _known_gaps(self) -> NDArray[np.float64]:

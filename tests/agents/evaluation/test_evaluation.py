@@ -217,7 +217,11 @@ def test_violations_have_intervals_and_columns():
     mean, low, high = summary["constraint_violations"]
     assert mean == pytest.approx(np.mean(shares))
     half = 1.96 * np.std(shares) / math.sqrt(40)  # of the normal approximation
-    assert (mean - low, high - mean) == pytest.approx((half, half), rel=0.15)
+    assert high - low == pytest.approx(2.0 * half, rel=0.15)
+    clean = dataclasses.replace(
+        evaluation, flights=evaluation.flights._replace(constraint_violations=np.zeros(40))
+    )
+    assert clean.constraint_violations == clean.violating_episodes == wilson_interval(0, 40)
     assert "violating" in str(evaluation_table([evaluation]).headings)
     # What leaves the limits may cost less than the optimum within them: no better optimum is known for that.
     flights = evaluation.flights._replace(is_success=np.ones(40, dtype=np.bool_))
@@ -235,9 +239,10 @@ def test_one_flight_has_gaps_without_intervals():
     optimal = OptimalCosts(plain.seeds, np.ones(1), np.ones(1, bool), np.zeros(1))
     evaluation = dataclasses.replace(plain, optimal=optimal)
     summary = json.loads(json.dumps(evaluation.summary(), allow_nan=False))
-    for name in ("median_cost_gap", "tail_cost_gap", "constraint_violations"):
+    for name in ("median_cost_gap", "tail_cost_gap"):
         assert summary[name][1:] == [None, None]
-    assert None not in summary["success_rate"]  # Wilson's interval holds for one flight too
+    for name in ("success_rate", "constraint_violations"):
+        assert None not in summary[name]  # Wilson's interval holds for one flight too
     table = evaluation_table([evaluation])
     cells = dict(zip(table.headings, table.rows[0], strict=True))
     assert float(cells["cost gap\n%"].replace(",", "")) == pytest.approx(
