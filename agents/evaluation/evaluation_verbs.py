@@ -99,6 +99,8 @@ def evaluate_policies(
         if out is not None and together:
             seeds = {"groups": [group_record(group) for group in together], "provenance": provenance()}
             write_atomically(out / f"seeds-{condition}.json", json.dumps(seeds) + "\n")
+        elif out is not None:
+            (out / f"seeds-{condition}.json").unlink(missing_ok=True)  # of an earlier run with other policies
         console.print(evaluation_table(evaluations).for_terminal())
         if together:
             console.print(groups_table(together).for_terminal())

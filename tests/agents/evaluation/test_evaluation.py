@@ -504,6 +504,9 @@ def test_the_command_writes_a_table_json_and_every_episode(tmp_path, capsys):
     assert [group["seeds"] for group in seeds["groups"]] == [[0, 1, 2]]
     assert [record["episodes"]["seed"] for record in records] == [evaluation_seeds(SHORT, 4)] * 3
     assert len(records[0]["episodes"]["cost"]) == 4
+    assert main(["evaluate", "--policy", *policies[:2], *arguments, *out]) == 0
+    assert not (tmp_path / "out" / "seeds-training.json").exists()  # it took three seeds together
+    capsys.readouterr()
     conditions = ["--condition", "training", "spin"]
     assert main(["evaluate", "--policy", policies[0], *arguments, "--json", *conditions]) == 0
     summaries = json.loads(capsys.readouterr().out)
