@@ -22,14 +22,15 @@ _QUANTILES = {"least": 0.0, "median": 0.5, "90 %": 0.9, "most": 1.0}
 
 def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[Row]]:
     """Solve the episodes of `env.reset(seed=)`."""
-    announce("the scene's own start", 0, effort.starts + 1)
+    # Without a spread, all starts are the scene's own.
+    starts = effort.starts if any(scene.spread.model_dump().values()) else 1
+    announce("the scene's own start", 0, starts + 1)
     expert = GuidedDDP(scene, max_iterations=effort.max_iterations)
     _ = expert.library  # solved now, so that it does not count as time of the first start
     env = DQSpaceArmEnv(scene)
     rows: list[Row] = []
-    # Without a spread, all starts are the scene's own.
-    for seed in range(effort.starts if any(scene.spread.model_dump().values()) else 1):
-        announce(f"start {seed}", seed + 1, effort.starts + 1)
+    for seed in range(starts):
+        announce(f"start {seed}", seed + 1, starts + 1)
         rows.append(solve_episode(expert, env, seed))
     return {"starts": rows}
 

@@ -272,7 +272,9 @@ def test_a_start_that_diverges_has_no_cost_in_the_distributions(short_scene: Sce
 
 
 def test_a_scene_without_spread_is_solved_once(short_scene: Scene) -> None:
-    found = expert_trials.measure(short_scene, EFFORT, announce)
+    told: list[tuple[int, int]] = []
+    found = expert_trials.measure(short_scene, EFFORT, lambda what, done, total: told.append((done, total)))
+    assert told == [(0, 2), (1, 2)]  # the nominal maneuver, and the only start
     assert len(found["starts"]) == 1
     assert "draws no starts" in expert_trials.section(short_scene, found).notes[0]
 
