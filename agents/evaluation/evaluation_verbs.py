@@ -29,7 +29,7 @@ from agents.zoo.finding import as_policy, check_fit, scene_of
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.command_line.policy_sources import statistics_by_model
 from dq_space_arm_env.common.console import message_console
-from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.files import json_value, write_atomically
 from dq_space_arm_env.common.progress import ProgressDisplay
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.results import Destination
@@ -91,14 +91,14 @@ def evaluate_policies(
                 evaluations.append(evaluation)
                 if out is not None:  # what is flown stays, whatever happens to the next
                     name = f"{number}-{Path(evaluation.policy).stem}-{condition}"
-                    content = json.dumps({**evaluation.record(), "provenance": provenance()})
+                    content = json.dumps(json_value({**evaluation.record(), "provenance": provenance()}))
                     out.mkdir(parents=True, exist_ok=True)
                     write_atomically(out / (re.sub(r"[^\w.-]+", "-", name) + ".json"), content + "\n")
         summaries += [evaluation.summary() for evaluation in evaluations]
         together = groups(evaluations)
         if out is not None and together:
             seeds = {"groups": [group_record(group) for group in together], "provenance": provenance()}
-            write_atomically(out / f"seeds-{condition}.json", json.dumps(seeds) + "\n")
+            write_atomically(out / f"seeds-{condition}.json", json.dumps(json_value(seeds)) + "\n")
         elif out is not None:
             (out / f"seeds-{condition}.json").unlink(missing_ok=True)  # of an earlier run with other policies
         console.print(evaluation_table(evaluations).for_terminal())
