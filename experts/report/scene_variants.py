@@ -209,7 +209,7 @@ def with_links(scene: Scene, count: int) -> Scene | None:
 def in_the_plane(scene: Scene) -> Scene:
     """The robot in the plane: no wrist, wheels, jets, other tips; axes along z, offsets turned to x.
 
-    Spherical joints turn about z.
+    Spherical joints, and those that would slide along z, turn about z.
     """
     flat = without_wrist(scene) if scene.wrist else scene
     out_of_plane = [name for name in ("wheels", "thrusters") if getattr(flat.actuators, name)]
@@ -221,7 +221,8 @@ def in_the_plane(scene: Scene) -> Scene:
         "links": [
             link.model_copy(
                 update={
-                    "joint_type": "revolute" if link.is_spherical else link.joint_type,
+                    "joint_type": "fixed" if link.is_fixed else "revolute",
+                    "pitch": 0.0,
                     "inertia": _flat_inertia(link.inertia),
                     "center_of_mass": _flat_vector(link.center_of_mass),
                     "joint": _flat_pose(link.joint),

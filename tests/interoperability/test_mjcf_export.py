@@ -302,7 +302,7 @@ def test_links_may_be_called_as_bodies_of_mujoco(names):
 
 def test_names_of_tips_are_not_given_twice():
     """Nor are the base's and the target's, which make way for links of these names."""
-    tip = {"name": "target_", "link": "base", "goal": {}}
+    tip = {"name": "target_", "link": "target", "goal": {}}
     scene = load_scene("no-wrist").replace(
         {"links.0.name": "base", "links.1.name": "target"}, other_tips=[tip, {**tip, "name": "base_"}]
     )

@@ -86,17 +86,17 @@ def test_an_episode_costs_what_the_kernels_say_stage_by_stage(name: str) -> None
 
 def test_motors_that_turn_and_motors_that_slide_share_a_weight_that_phases_change() -> None:
     phases = [{"name": "a", "steps": 1}, {"name": "b", "steps": 1, "changes": {"cost.joint_torque": 10.0}}]
-    scene = load_scene("planar").replace(
+    scene = load_scene("no-wrist").replace(
         {"links.1.joint_type": "prismatic", "phases": phases, "simulation.steps": 2}
     )
     env = dq_space_arm_env.DQSpaceArmEnv(scene)
-    kernels, action = env.kernels, np.full(6, 0.5)
+    kernels, action = env.kernels, np.full(9, 0.5)
     assert kernels.parameters.names == ("phase", "cost.joint_torque")
     assert kernels.parameters.units == ("1", "(N m)^-2 or (N)^-2")
     env.reset(seed=0)
     for row in kernels.stage_parameters()[:2]:
         effort = kernels.cost(env.state, kernels.layout.to_control(action), p=row)
-        effort -= kernels.cost(env.state, np.zeros(6), p=row)
+        effort -= kernels.cost(env.state, np.zeros(9), p=row)
         assert env.step(action)[-1]["cost_control"] == pytest.approx(effort, rel=1e-12)
 
 
