@@ -96,9 +96,9 @@ def search(
         **provenance("optuna"),
     }
     drawable = any(row["median_cost"] is not None for row in found.trials)
-    draw = (lambda: _picture(found.trials, varied)) if drawable else None
+    pictures = {"search.png": lambda: _picture(found.trials, varied)} if drawable else {}
     record = json_value(content)
-    lines = written.write("search", record, draw)
+    lines = written.write("search", record, pictures)
     console = written.console(150)
     console.print(_table(found.trials, varied).for_terminal())
     for row in found.trials:
@@ -106,9 +106,7 @@ def search(
             complain(f"trial {row['trial']}: {row['failure']}", label="Failed: ")
     if found.best is not None:
         console.print(f"Best: trial {found.best['trial']}, {found.file}", markup=False, soft_wrap=True)
-    for line in lines:
-        console.print(line, markup=False)
-    written.print(record)
+    written.tell(console, lines, record)
     return FAILURE if found.best is None else SUCCESS
 
 

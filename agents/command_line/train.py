@@ -147,14 +147,12 @@ def _train_several(
     summaries = [*many_trainings.seed_summaries(rows)]
     destination = Destination(folder, picture=False, document=as_json)
     record: dict[str, Any] = json_value({"runs": rows, "seeds": summaries, **provenance()})
-    written = destination.write("runs", record, None)
+    written = destination.write("runs", record, {})
     console = destination.console()
     console.print(many_trainings.trainings_table(rows).for_terminal())
     if summaries:
         console.print(many_trainings.seeds_table(summaries).for_terminal())
-    for line in written:
-        console.print(line, markup=False)
-    destination.print(record)
+    destination.tell(console, written, record)
     failed = [row for row in rows if row["outcome"] == "failed"]
     for row in failed:
         complain(f"{row['agent']}, seed {row['seed']}: {row['failure']}", label="Failed: ")

@@ -74,14 +74,12 @@ def run(destination: Destination, options: Options) -> None:
         "trainings": trainings,
         **provenance("torch"),
     }
-    written = destination.write("cloning", record, lambda: _picture(measured))
+    written = destination.write("cloning", record, {"cloning.png": lambda: _picture(measured)})
     title = f"Cloning: {effort.updates} updates, flights from {len(tests)} starts"
     console.print(tabulate(title, measured, _columns()).for_terminal())
     for sentence in _verdict(measured):
         console.print(sentence, markup=False, soft_wrap=True)
-    for line in written:
-        console.print(line, markup=False)
-    destination.print(record)
+    destination.tell(console, written, record)
 
 
 def _data(

@@ -159,7 +159,7 @@ def save_comparison(
     """Write a comparison as Markdown, as JSON, and as a picture, and print it."""
     content = {**record(found), **provenance()}
     write_atomically(destination.folder / "table.md", markdown(title, tables, found))
-    written = destination.write("comparison", content, draw)
+    written = destination.write("comparison", content, {"comparison.png": draw})
     console = destination.console(180)
     for table in tables:
         console.print(table.for_terminal())
@@ -168,6 +168,4 @@ def save_comparison(
     console.print("Commands that reproduce the rows:")
     for command in found.commands:
         console.print(f"  {command}", markup=False, soft_wrap=True)
-    for line in written:
-        console.print(line, markup=False)
-    destination.print(content)
+    destination.tell(console, written, content)

@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from agents.evaluation.beside_expert import SideBySide, fly_beside_expert
 from agents.zoo.finding import as_policy, scene_of
 from dq_space_arm_env import load_scene
-from dq_space_arm_env.common.files import to_json, write_atomically
+from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.provenance import provenance
-from dq_space_arm_env.common.report_page import NO_PICTURE
 from dq_space_arm_env.common.results import Destination
 from dq_space_arm_env.common.tables import Column, TextTable, tabulate
 from dq_space_arm_env.viewing.picture_format import PictureFormat
@@ -22,7 +20,6 @@ from experts.maneuver import Maneuver
 
 _FRAMES_PER_SECOND = 20.0
 _HOLD = 2.0  # s, of the last picture
-_PICTURES = ("errors.png", "inputs.png")
 
 
 def show(
@@ -51,15 +48,21 @@ def show(
     first = 0 if seed is None else seed + 1
     pairs = fly_beside_expert(acting, flown, [seed, *range(first, first + n - 1)])
     record = {"flights": [pair.record() for pair in pairs], **provenance()}
-    written, console = _save(destination, record, gif, pairs), destination.console(120)
+    pictures = {
+        "errors.png": lambda: _drawn("errors", pairs[0]),
+        "inputs.png": lambda: _drawn("inputs", pairs[0]),
+    }
+    written, console = destination.write("flight", record, pictures), destination.console(120)
+    if gif is not None:
+        gif.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(gif, _animation(pairs[0].agent.maneuver))
+        written.append(str(gif))
     console.print(_table(pairs).for_terminal())
     if n == 1:
         verb = "reaches" if pairs[0].agent.is_success else "does NOT reach"
         gap = f"its cost gap is {100.0 * pairs[0].cost_gap:.2f} %."
         console.print(f"{pairs[0].agent.name} {verb} the target; {gap}", markup=False)
-    for line in written:
-        console.print(line, markup=False)
-    destination.print(record)
+    destination.tell(console, written, record)
     return all(pair.agent.is_success for pair in pairs)
 
 
@@ -93,30 +96,12 @@ def _table(pairs: Sequence[SideBySide]) -> TextTable:
     return tabulate(f"Scene {scene.name}; tolerance {named}", rows, columns)
 
 
-def _save(
-    destination: Destination, record: dict[str, Any], gif: Path | None, pairs: Sequence[SideBySide]
-) -> list[str]:
-    """Write record and pictures; lines that name the files."""
-    folder = destination.folder
-    folder.mkdir(parents=True, exist_ok=True)
-    files, lines = ["flight.json"], []
-    write_atomically(folder / files[0], to_json(record))
-    if destination.picture and find_spec("matplotlib") is not None:
-        from agents.evaluation.beside_expert_figure import errors_figure, inputs_figure
-        from experts.figures.style import as_png
+def _drawn(what: str, pair: SideBySide) -> bytes:
+    """Draw errors or inputs as PNG."""
+    from agents.evaluation import beside_expert_figure
+    from experts.figures.style import as_png
 
-        for name, make in zip(_PICTURES, (errors_figure, inputs_figure), strict=True):
-            write_atomically(folder / name, as_png(partial(make, pairs[0])))
-            files.append(name)
-    else:
-        for name in _PICTURES:
-            (folder / name).unlink(missing_ok=True)  # of an earlier run: it may show another flight
-        lines += [NO_PICTURE] if destination.picture else []
-    if gif is not None:
-        gif.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(gif, _animation(pairs[0].agent.maneuver))
-        files.append(str(gif))
-    return [*lines, f"{folder}: {', '.join(files)}"]
+    return as_png(partial(getattr(beside_expert_figure, f"{what}_figure"), pair))
 
 
 def _animation(maneuver: Maneuver) -> bytes:

@@ -207,7 +207,7 @@ def _times(scene: Scene) -> Iterator[str]:
 
 
 def _path(scene: Scene) -> Iterator[str]:
-    """Waypoints after the end of the episode, and targets that spin."""
+    """Waypoints that begin elsewhere or come after the end of the episode, and targets that spin."""
     motion, seconds = scene.target.motion, scene.simulation.steps * scene.simulation.dt
     if isinstance(motion, Waypoints):
         if motion.points[0].pose != scene.target.pose:

@@ -1,6 +1,6 @@
 """Destination of the results of a measuring command."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,21 +25,31 @@ class Destination:
         """Make the console for tables."""
         return table_console(width, stderr=self.document)
 
-    def write(self, name: str, record: dict[str, Any], draw: Callable[[], bytes] | None) -> list[str]:
-        """Write a record as JSON, and draw its picture as PNG; lines that name the files.
+    def write(
+        self, name: str, record: dict[str, Any], pictures: Mapping[str, Callable[[], bytes]]
+    ) -> list[str]:
+        """Write a record as JSON, and pictures by the names of their files; lines that name the files.
 
         Write before anything is printed: nobody may be there to read it.
         """
-        files, lines, picture = [f"{name}.json"], [], self.folder / f"{name}.png"
+        self.folder.mkdir(parents=True, exist_ok=True)
+        files, lines = [f"{name}.json"], []
         write_atomically(self.folder / files[0], to_json(record))
-        drawable = find_spec("matplotlib") is not None
-        if draw is not None and self.picture and drawable:
-            files.append(picture.name)
-            write_atomically(picture, draw())
-        elif draw is not None:
-            picture.unlink(missing_ok=True)  # of an earlier run: it may show other results
+        if self.picture and find_spec("matplotlib") is not None:
+            for file, draw in pictures.items():
+                write_atomically(self.folder / file, draw())
+                files.append(file)
+        elif pictures:
+            for file in pictures:
+                (self.folder / file).unlink(missing_ok=True)  # of an earlier run: it may show other results
             lines += [NO_PICTURE] if self.picture else []
         return [*lines, f"{self.folder}: {', '.join(files)}"]
+
+    def tell(self, console: Console, written: list[str], record: dict[str, Any]) -> None:
+        """Print the lines that `write` returns, and the document, if one is wanted."""
+        for line in written:
+            console.print(line, markup=False)
+        self.print(record)
 
     def print(self, record: dict[str, Any]) -> None:
         """Print the document, if one is wanted."""
