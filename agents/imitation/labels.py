@@ -12,7 +12,8 @@ from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import uninterrupted
 from experts.demonstrations import Demonstrations, DemonstrationsError
 from experts.demonstrations.reading import Demonstration
-from experts.guesses.guided import NEAR_REGULARIZATION, RESERVE
+from experts.guesses.guided import RESERVE
+from experts.guesses.initial_guesses import NEAR_REGULARIZATION
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from experts.problems.window_problem import WindowProblem

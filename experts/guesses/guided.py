@@ -1,6 +1,6 @@
 """Guided DDP: box-DDP from initial guesses (`initial_guesses`), which reaches the target.
 
-One good maneuver per scene is enough to guess from, and worth some effort (`START_REGULARIZATIONS`).
+One good maneuver per scene is enough to guess from, and worth some effort (`GuessSolver`).
 
 All of this happens in few, long steps first (`coarsening`), where a solve takes a tenth of the time and
 several guesses can be compared. The policy found there, followed in the problem's own steps, is a few
@@ -11,7 +11,7 @@ task. Then they become constraints, and the solve goes on from there: it finds t
 reaches the target. Kernels with constraints are compiled for the first start that needs them.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Self, cast
@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dq_space_arm_env.common.real_arrays import real_array
-from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.second_order import SecondOrder
 from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason, uninterrupted
-from experts.guesses.attempts import Attempt, best_solution, is_known
+from experts.guesses.attempts import Attempt, GuessSolver
 from experts.guesses.coarsening import checked_factors, find_coarsening
 from experts.guesses.initial_guesses import (
+    NEAR_REGULARIZATION,
     SCREW_REGULARIZATION,
     Guess,
     KinematicGuess,
@@ -46,16 +46,6 @@ from experts.problems.shooting_problem import (
     check_state,
     check_whole,
 )
-from experts.problems.window_problem import WindowProblem
-
-START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
-"""First regularizations of solves of the initial state from zero controls; the cheapest solution is kept."""
-NEAR_REGULARIZATION = 0.0
-"""First regularization where constraints begin, or steps become shorter: the minimum is near."""
-NEAR_ITERATIONS = 10
-"""Long steps are short enough if their policy is within so many iterations of the problem's own minimum."""
-NEAR_ITERATIONS_CONSTRAINED = 40
-"""The same where there are constraints, whose multipliers follow."""
 
 RESERVE = 0.05
 """Share of the tolerances that demonstrations and controllers keep free for rounding and disturbances."""
@@ -127,17 +117,10 @@ class GuidedDDP:
         check_at_least("reserve", reserve, 0.0)
         if reserve >= 0.5:
             raise ValueError(f"reserve is {reserve}; it must be less than 0.5")
-        self._settings: dict[str, Any] = {
-            "max_iterations": max_iterations,
-            "tolerance": tolerance,
-            "second_order": second_order,
-        }
-        self._solver = BoxDDP(scene_or_problem, **self._settings)
+        settings = {"max_iterations": max_iterations, "tolerance": tolerance, "second_order": second_order}
+        self._solver = GuessSolver(scene_or_problem, reach_target=reach_target, reserve=reserve, **settings)
         self.problem: ShootingProblem = self._solver.problem
-        self.attempts = attempts
-        self.reach_target, self.reserve = reach_target, reserve
-        self._has_constraints = getattr(self.problem, "constraints", None) is not None
-        self._constrained_solver: BoxDDP | None = None  # nothing is compiled for it until it is needed
+        self.attempts, self.reserve = attempts, reserve
         self._kinematic_guess: KinematicGuess | None = None
         if screw_motion and isinstance(self.problem, ArmProblem):
             self._kinematic_guess = partial(guess_screw_motion, self.problem)
@@ -165,7 +148,7 @@ class GuidedDDP:
         if self._coarse is not None:
             return tuple(refined(solution, self.problem) for solution in self._coarse.library)
         if self._library is None:
-            self._library = self._solve_initial_state()
+            self._library = self._solver.solve_initial_state()
         return tuple(self._library)
 
     @property
@@ -185,7 +168,7 @@ class GuidedDDP:
     def second_order(self) -> str:
         """Second derivatives that it uses, see `BoxDDP`; found together with `coarsening`."""
         _ = self.coarsening
-        return self._solver.second_order.value
+        return self._solver.second_order
 
     def solve(
         self,
@@ -228,15 +211,15 @@ class GuidedDDP:
         long_steps: tuple[dict[str, Any], ...] = ()
         for guess in self._guesses(start, callback):
             long_steps += guess.long_steps
-            attempts += self._attempts(guess, start, callback, attempts)
+            attempts += self._solver.attempts(guess, start, callback, attempts)
             last = attempts[-1].solution
             interrupted = guess.interrupted or last.stop_reason is StopReason.INTERRUPTED
-            if interrupted or (self._is_good(last) and not self.compare):
+            if interrupted or (self._solver.is_good(last) and not self.compare):
                 break
         if self.compare and not interrupted:
             attempts += self._other_side(attempts, start, callback)
             interrupted = attempts[-1].solution.stop_reason is StopReason.INTERRUPTED
-        solution = best_solution(attempts, self.problem, self._is_good)
+        solution = self._solver.best(attempts)
         if interrupted and solution.stop_reason is not StopReason.INTERRUPTED:
             # An attempt before that one is the cheapest; that it converged does not undo the interrupt.
             message = "interrupted by the user"
@@ -245,33 +228,13 @@ class GuidedDDP:
         self._remember(solution)
         return solution
 
-    def _attempts(
-        self, guess: Guess, start: FloatArray, callback: Callback | None, before: Sequence[Attempt]
-    ) -> list[Attempt]:
-        """Solve from a guess, and lead a minimum that ends outside the tolerances to the target.
-
-        A minimum that one of the attempts before found was led from there.
-        """
-        solution = self._solve_from(guess, start, callback)
-        attempts = [Attempt(guess.name, solution)]
-        misses = solution.converged and not self._is_good(solution)
-        can_be_led = isinstance(self.problem, ArmProblem | WindowProblem) and solution.constraints is None
-        wanted = self.reach_target and not guess.interrupted
-        if wanted and misses and can_be_led and not is_known(solution, before):
-            solver = self._constrained
-            solver.initial_regularization = NEAR_REGULARIZATION
-            rows = self.problem.parameters.rows
-            led = solver.solve(start, solution.controls, callback, parameters=rows)
-            attempts.append(Attempt(guess.name, led))
-        return attempts
-
     def _other_side(
         self, attempts: Sequence[Attempt], start: FloatArray, callback: Callback | None
     ) -> list[Attempt]:
         """Solve on the other side of an obstacle that is in the way of the best solution so far, if any."""
-        if not self._has_constraints or not isinstance(self.problem, ArmProblem):
+        if not self._solver.has_constraints or not isinstance(self.problem, ArmProblem):
             return []
-        best = best_solution(attempts, self.problem, self._is_good)
+        best = self._solver.best(attempts)
         motion = other_side(self.problem, best)
         if motion is None:
             return []
@@ -280,7 +243,7 @@ class GuidedDDP:
         guess = Guess(
             "other side", controls, cost, SCREW_REGULARIZATION, multipliers=np.zeros_like(best.multipliers)
         )
-        return self._attempts(guess, start, callback, attempts) if np.isfinite(cost) else []
+        return self._solver.attempts(guess, start, callback, attempts) if np.isfinite(cost) else []
 
     def _remember(self, solution: Solution) -> None:
         """Add a solution to the library if there is room and it is new."""
@@ -335,35 +298,6 @@ class GuidedDDP:
             multipliers=multipliers_of(policy),
         )
 
-    def _solve_from(self, guess: Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
-        """Solve, with the tolerances as constraints if the guess has multipliers of theirs."""
-        solver = self._solver_for(guess)
-        solver.initial_regularization = guess.regularization
-        return solver.solve(
-            start,
-            guess.controls,
-            _interrupt if guess.interrupted else callback,
-            parameters=self.problem.parameters.rows,
-            multipliers=guess.multipliers,
-        )
-
-    def _solver_for(self, guess: Guess) -> BoxDDP:
-        """The solver of a guess; its multipliers may be those of tolerances."""
-        return self._solver if self._has_constraints or guess.multipliers is None else self._constrained
-
-    @property
-    def _constrained(self) -> BoxDDP:
-        """The solver of the same problem with its tolerances as constraints."""
-        if self._constrained_solver is None:
-            problem = cast(ArmProblem | WindowProblem, self.problem).constrained(self.reserve)
-            self._constrained_solver = BoxDDP(problem, **self._settings)
-        return self._constrained_solver
-
-    def _is_good(self, solution: Solution) -> bool:
-        """Whether a solution has converged, and is a success if the problem knows of any."""
-        succeeds: Callable[[FloatArray, FloatArray], bool] | None = getattr(self.problem, "is_success", None)
-        return solution.converged and (succeeds is None or succeeds(solution.states, solution.controls))
-
     def in_long_steps(
         self, coarsening: Sequence[int], *, second_order: str | None = None, after: Self | None = None
     ) -> Self:
@@ -379,13 +313,13 @@ class GuidedDDP:
         """
         known, factor = self._library, coarsening[-1]
         problem = cast(ArmProblem, self.problem).coarsened(factor)
-        settings = {**self._settings, **({} if second_order is None else {"second_order": second_order})}
+        settings = self._solver.settings
+        if second_order is not None:
+            settings["second_order"] = second_order
         found = type(self)(
             problem,
             library=None if known is None else [coarsened(member, problem) for member in known],
             screw_motion=self._kinematic_guess is not None,
-            reach_target=self.reach_target,
-            reserve=self.reserve,
             remember=self._vacancies,
             attempts=self.attempts,
             compare=len(coarsening) == 1,
@@ -406,7 +340,7 @@ class GuidedDDP:
             self._coarsening, self._coarse = find_coarsening(self)
             if key is not None:
                 self._take_model_that_reaches()
-                found = self._coarsening, self._solver.second_order.value, self._longest.library
+                found = self._coarsening, self._solver.second_order, self._longest.library
                 keep_preparation(key, Preparation(*found))
             return
         if known.second_order != self._solver.second_order:
@@ -418,7 +352,7 @@ class GuidedDDP:
 
     def _take_model_that_reaches(self) -> None:
         """Take the mirrored model if only that reaches the target, from the problem's own start."""
-        if not self.chooses_model or not self.reach_target or self._reaches():
+        if not self.chooses_model or not self._solver.reach_target or self._reaches():
             return
         other = type(self)(self.problem, **self._own_settings | {"second_order": SecondOrder.MIRRORED.value})
         if other._reaches():
@@ -427,9 +361,9 @@ class GuidedDDP:
 
     def _reaches(self) -> bool:
         """Whether the maneuver from the problem's own start reaches the target."""
-        longest = self._longest
+        longest, is_good = self._longest, self._solver.is_good
         try:
-            return any(map(longest._is_good, longest.library)) or self._is_good(uninterrupted(self.solve()))
+            return any(map(longest._solver.is_good, longest.library)) or is_good(uninterrupted(self.solve()))
         except KeyboardInterrupt:
             self._coarsening = None  # the next access begins anew
             raise
@@ -437,8 +371,8 @@ class GuidedDDP:
     @property
     def _own_settings(self) -> dict[str, Any]:
         """The settings that a preparation follows from, by their names."""
-        own = {name: getattr(self, name) for name in ("attempts", "compare", "reach_target", "reserve")}
-        return {**self._settings, **own, "screw_motion": self._kinematic_guess is not None}
+        own = {"attempts": self.attempts, "compare": self.compare}
+        return {**self._solver.settings, **own, "screw_motion": self._kinematic_guess is not None}
 
     @property
     def _longest(self) -> "GuidedDDP":
@@ -451,8 +385,7 @@ class GuidedDDP:
         Args:
             second_order: See `BoxDDP`.
         """
-        self._settings = {**self._settings, "second_order": second_order}
-        self._solver, self._constrained_solver = BoxDDP(self.problem, **self._settings), None
+        self._solver = self._solver.with_model(second_order)
         self.chooses_model = False
 
     def leads_to_minimum(self, coarse: "GuidedDDP") -> bool:
@@ -467,31 +400,7 @@ class GuidedDDP:
         start = self.problem.initial_state
         self.problem.parameters.set(None)
         guess = self._coarse_guess(coarse, start, None)
-        if guess is None:
-            return False
-        constrained = guess.multipliers is not None
-        solver = self._solver_for(guess)
-        most = solver.max_iterations
-        solver.max_iterations = NEAR_ITERATIONS_CONSTRAINED if constrained else NEAR_ITERATIONS
-        try:
-            return uninterrupted(self._solve_from(guess, start)).converged
-        finally:
-            solver.max_iterations = most
-
-    def _solve_initial_state(self) -> list[Solution]:
-        """Solve the problem's own initial state; no solution if every rollout diverges."""
-        start = np.asarray(self.problem.initial_state, dtype=np.float64)
-        self.problem.parameters.set(None)
-        solutions: list[Solution] = []
-        for regularization in START_REGULARIZATIONS:
-            solutions.append(uninterrupted(self._solve_from(zero_controls(regularization), start)))
-        best = min(solutions, key=lambda solution: solution.cost)
-        return [best] if np.isfinite(best.cost) else []
-
-
-def _interrupt(record: IterationRecord) -> None:
-    """End a solve as the user ended the one before."""
-    raise KeyboardInterrupt
+        return guess is not None and self._solver.is_near_minimum(guess, start)
 
 
 def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> None:

@@ -28,6 +28,8 @@ SCREW_REGULARIZATION = 1e2
 """First regularization from a screw motion: the arm is not wound up, and long steps rarely wind it up."""
 ZERO_REGULARIZATION = 1e4
 """First regularization from zero controls: short first steps rarely end in a poor minimum."""
+NEAR_REGULARIZATION = 0.0
+"""First regularization where constraints begin, or steps become shorter: the minimum is near."""
 
 KinematicGuess = Callable[[FloatArray], ScrewMotion]
 

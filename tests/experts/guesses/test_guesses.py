@@ -22,7 +22,7 @@ from dq_space_arm_env.scene.start import (
 )
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.demonstrations.outcomes import GUESSES
-from experts.guesses.guided import START_REGULARIZATIONS
+from experts.guesses.attempts import START_REGULARIZATIONS
 from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION, ranked_guesses
 from experts.guesses.other_side import contacts_of, other_side
 from experts.guesses.policies import follow
