@@ -207,7 +207,7 @@ def show(
     from agents.evaluation.showing import show as fly_and_show
 
     if gif is not None:
-        check_writable_file(gif)
+        check_writable_file(gif, chosen, scene, normalize)
     written = destination(out, as_json, picture)
     reached = fly_and_show(written, chosen, scene, seed, n, gif, trust=trust, normalize=normalize)
     return SUCCESS if reached else FAILURE

@@ -66,15 +66,11 @@ def replay(
     from dq_space_arm_env.command_line.replaying import collect_flights
     from dq_space_arm_env.viewing.replay import write_replay
 
-    check_writable_file(out)
     sources = [_labeled(flight) for flight in flights]
     for place, label in enumerate(labels):
         sources[place] = label, sources[place][1]
-    files = [Path(source, name).resolve() for _, source in sources for name in ("", "solution.npz")]
-    if out.resolve() in files:
-        raise ValueError(f"--out: {out} is one of the flights, which it would replace: name another file")
-    if out.resolve() in [Path(read).resolve() for read in (scene, normalize) if read is not None]:
-        raise ValueError(f"--out: {out} is read for the page, which would replace it: name another file")
+    flown = [Path(source, name) for _, source in sources for name in ("", "solution.npz")]
+    check_writable_file(out, scene, normalize, *flown)
     (shown, robot), *others = collect_flights(
         sources,
         None if scene is None else load_scene(scene),

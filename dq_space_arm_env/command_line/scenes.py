@@ -163,30 +163,21 @@ def new(file: str, source: str, name: str | None, force: bool, as_json: bool) ->
         message_console().print(sentence, markup=False, soft_wrap=True)
 
 
-def _scene_file(file: str, force: bool) -> Path:
+def _scene_file(file: str, force: bool, *read: str) -> Path:
     """Check the path of a scene to write."""
     path = Path(file)
     if path.suffix not in (".yaml", ".yml"):
         raise click.UsageError(
             f"{file}: the name of a scene file must end in .yaml", click.get_current_context()
         )
-    _check_free(path, force)
+    _check_free(path, force, *read)
     return path
 
 
-def _check_free(path: Path, force: bool) -> None:
-    check_writable_file(path)
+def _check_free(path: Path, force: bool, *read: str) -> None:
+    check_writable_file(path, *read)
     if path.exists() and not force:
         raise click.UsageError(f"{path} exists: give another name, or --force", click.get_current_context())
-
-
-def _check_kept(path: Path, source: str) -> None:
-    """Refuse to replace the file that a robot is read from, even by force."""
-    if path.is_file() and path.resolve() == Path(source).resolve():
-        raise click.UsageError(
-            f"--out: {path} is what is read, which it would replace: name another file",
-            click.get_current_context(),
-        )
 
 
 def _write(path: Path, text: str) -> None:
@@ -347,8 +338,7 @@ def import_(
     from dq_space_arm_env.command_line import scene_exchange
     from dq_space_arm_env.command_line.scene_template import commented_yaml
 
-    path = _scene_file(out or f"{Path(robot).stem}.yaml", force)
-    _check_kept(path, robot)
+    path = _scene_file(out or f"{Path(robot).stem}.yaml", force, robot)
     arguments["name"] = arguments.get("name") or path.stem
     if replay:
         check_writable_file(path.with_suffix(".html"))
@@ -437,8 +427,7 @@ def export(
     from dq_space_arm_env.command_line import scene_exchange
 
     if out is not None:
-        _check_free(out, force)
-        _check_kept(out, scene)
+        _check_free(out, force, scene)
     text = scene_exchange.export(scene, language, wrist)
     if out is None:
         # XML is UTF-8 unless it says otherwise; where the terminal is not, names get references.

@@ -102,10 +102,7 @@ def simulate(
 
     loaded = load_scene(scene)
     if out is not None:
-        check_writable_file(out)
-        read = (scene, policy, start, normalize)
-        if out.resolve() in [Path(given).resolve() for given in read if given is not None]:
-            raise ValueError(f"--out: {out} is what is flown, which it would replace: name another file")
+        check_writable_file(out, scene, policy, start, normalize)
     disturbance = read_noise(noise, loaded)
     if (drowned := drowned_inputs(disturbance, loaded)) is not None:
         complain(drowned, label="Warning: ")

@@ -112,18 +112,18 @@ def test_a_page_does_not_replace_a_flight(rollout: Path, capsys: pytest.CaptureF
     solution = rollout.with_name("solution.npz")
     solution.write_bytes(rollout.read_bytes())
     assert main(["replay", str(rollout.parent), "--out", str(solution)]) == 2
-    assert "is one of the flights" in " ".join(capsys.readouterr().err.split())
+    assert "which it would replace" in " ".join(capsys.readouterr().err.split())
     assert solution.read_bytes() == rollout.read_bytes()
     content = rollout.read_bytes()
     other = f"{rollout.parent}/../{rollout.parent.name}/{rollout.name}"
     assert main(["replay", str(rollout), "--out", other]) == 2
-    assert "is one of the flights" in " ".join(capsys.readouterr().err.split())
+    assert "which it would replace" in " ".join(capsys.readouterr().err.split())
     assert rollout.read_bytes() == content
     for option, name in (("--scene", "scene.yaml"), ("--normalize", "statistics.pkl")):
         read = rollout.with_name(name)
         read.write_text("mine", encoding="utf-8")
         assert main(["replay", str(rollout), option, str(read), "--out", str(read)]) == 2
-        assert "is read for the page" in " ".join(capsys.readouterr().err.split())
+        assert "which it would replace" in " ".join(capsys.readouterr().err.split())
         assert read.read_text(encoding="utf-8") == "mine"
 
 
