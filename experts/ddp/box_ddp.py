@@ -42,6 +42,7 @@ from experts.problems.shooting_problem import (
     check_control_weights,
     check_state,
     check_whole,
+    rate_limits,
     stage_bounds,
 )
 from experts.problems.stage_constraints import StageConstraints
@@ -378,6 +379,11 @@ class BoxDDP:
         controls = real_array("u_init", u_init, np.float64)
         check_array("u_init", controls, shape)
         outside = (controls < lower) | (controls > upper)
+        limits = rate_limits(problem)
+        which, before = limits.controls, np.vstack([state[limits.states], controls[:-1, limits.controls]])
+        nearest = np.clip(controls[:, which], lower[:, which], upper[:, which])
+        nearest = np.clip(nearest, before - limits.change, before + limits.change)
+        outside[:, which] &= controls[:, which] != nearest  # a rate may keep it from bounds that come closer
         if np.any(outside):
             k, i = (int(index[0]) for index in np.nonzero(outside))
             raise ValueError(

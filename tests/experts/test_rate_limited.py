@@ -103,3 +103,26 @@ def test_wheels_and_thrusters_keep_to_their_rates(name, rates):
     assert solution.converged
     assert changes(solution, solver.problem).max() == pytest.approx(1.0, abs=1e-12)
     assert solution.controls[:, solver.problem.kernels.layout.control.thruster_force].min(initial=0.0) >= 0.0
+
+
+@pytest.mark.slow
+def test_controls_that_run_down_where_a_phase_switches_them_off_are_a_guess():
+    """Their rates keep them out of limits of zero for some stages."""
+    coasting = {"name": "coasting", "steps": 12, "changes": {"actuators": {"base_torque": None}}}
+    scene = load_scene(
+        {
+            "name": "wheel that runs down",
+            "base": {"motion": "planar", "mass": 20.0, "inertia": [1.0, 1.0, 1.0]},
+            "actuators": {"base_torque": {"limit": 1.0, "slew_limit": 2.0}},
+            "target": {"pose": {"rotation": {"axis": [0, 0, 1], "angle": 60}}},
+            "simulation": {"steps": 24, "dt": 0.1},
+            "phases": [{"name": "turning", "steps": 12}, coasting],
+        }
+    )
+    solver = BoxDDP(scene)
+    solution = solver.solve()
+    assert solution.controls[12, 0] != 0.0
+    assert solver.solve(u_init=solution.controls).iterations == 0
+    solution.controls[13] = 0.5
+    with pytest.raises(ValueError, match=r"u_init\[13, 0\] is 0\.5, outside \[-0\.0, 0\.0\]"):
+        solver.solve(u_init=solution.controls)
