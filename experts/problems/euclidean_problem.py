@@ -40,7 +40,8 @@ def runge_kutta(dynamics: Function, time_step: float) -> Function:
         Function of the same arguments that returns the state after the step.
 
     Raises:
-        ValueError: If the duration is no positive, finite number.
+        ValueError: If the duration is no positive, finite number; the step, if the dynamics return another
+            number of rates than of states.
     """
     check_duration("time_step", time_step)
     h = float(time_step)
@@ -48,9 +49,12 @@ def runge_kutta(dynamics: Function, time_step: float) -> Function:
     def step(x: Any, u: Any, *p: Any) -> Any:
         def rate(state: Any) -> Any:
             value = dynamics(state, u, *p)
-            if not isinstance(value, list | tuple):
-                return value
-            return casadi.vertcat(*value) if isinstance(x, casadi.SX) else np.array(value)
+            if isinstance(value, list | tuple):
+                value = casadi.vertcat(*value) if isinstance(x, casadi.SX) else np.array(value)
+            found, expected = _count(value), _count(x)
+            if found != expected:  # one would be the rate of all
+                raise ValueError(f"dynamics returns {found} numbers; expected {expected}, one for each state")
+            return value
 
         k1 = rate(x)
         k2 = rate(x + 0.5 * h * k1)
@@ -59,6 +63,10 @@ def runge_kutta(dynamics: Function, time_step: float) -> Function:
         return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
     return step
+
+
+def _count(value: Any) -> int:
+    return int(value.numel() if hasattr(value, "numel") else np.size(value))
 
 
 class EuclideanProblem(ABC):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
-from experts import BoxDDP, CasadiProblem, GuidedDDP, runge_kutta
+from experts import BoxDDP, CasadiProblem, GuidedDDP, PythonProblem, runge_kutta
 from scripts.examples import cart_pole as cart_pole_example
 from scripts.examples import planar_quadrotor as quadrotor_example
 from scripts.examples.cart_pole import cart_pole
@@ -253,6 +253,13 @@ def test_contradictions_are_refused(changes, error, sentence):
 def test_a_step_of_no_duration_is_refused(duration):
     with pytest.raises(ValueError, match=r"time_step is .*; it must be a positive number of seconds"):
         runge_kutta(lambda x, u: x, duration)
+
+
+@pytest.mark.parametrize("kind", [CasadiProblem, PythonProblem])
+def test_one_rate_is_not_spread_over_all_states(kind):
+    step = runge_kutta(lambda x, u: [u[0]], 0.1)
+    with pytest.raises(ValueError, match="dynamics returns 1 numbers; expected 2, one for each state"):
+        kind(step, lambda x, u: u[0] ** 2, lambda x: x[0], initial_state=[0, 0], n_controls=1, horizon=3)
 
 
 def test_a_control_without_a_weight_is_refused():
