@@ -299,7 +299,10 @@ class ModelWatch:
         if self.identification is not None:
             self.identification.update(before, control, measured, stage)
             return None
-        authority = np.abs(work.derivatives.B[0][self._rates]) @ work.bounds[1][0]
+        by_state, by_input = (abs(each[0][self._rates]) for each in (work.derivatives.A, work.derivatives.B))
+        limits, layout = work.bounds[1][0], self._maneuver.kernels.layout
+        on_the_way = [chain.control for chain in layout.chains for _ in chain.names]  # acts in its place
+        authority = by_input @ limits + by_state[:, layout.tangent.drives] @ limits[on_the_way]
         self._detector.observe((measured - landed)[self._stored], authority)
         if not self._detector.is_certain:
             return None

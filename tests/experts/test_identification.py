@@ -73,6 +73,26 @@ def test_the_numbers_are_found(changes, factors, experts):
     assert expert.estimates == {}
 
 
+@pytest.mark.slow
+def test_a_spring_is_found_where_all_commands_act_later():
+    boom = {"name": "boom", "mass": 5.0, "inertia": [0.4, 0.4, 0.4], "center_of_mass": [0.5, 0.0, 0.0]}
+    scene = load_scene(
+        {
+            "name": "late commands",
+            "base": {"motion": "planar", "mass": 100.0, "inertia": [10.0, 10.0, 9.0]},
+            "links": [{**boom, "joint": {"position": [0.5, 0.0, 0.0]}}],
+            "tip": {"position": [1.0, 0.0, 0.0]},
+            "actuators": {"joint_torque": {"limit": 2.0, "delay": 1}},
+            "target": {"pose": {"position": [0.8, 0.6, 0.0]}},
+            "simulation": {"steps": 60, "dt": 0.1},
+            "parameters": ["links.0.stiffness"],
+        }
+    )
+    expert = RecedingHorizonExpert(scene, horizon=15)
+    fly(expert, np.array([3.0]))
+    assert expert.estimates["links.0.stiffness"] == pytest.approx(3.0, rel=5e-3)
+
+
 def test_what_is_told_in_mid_flight_is_not_estimated_on_top(experts):
     expert, told = experts[True], 40
     kernels = expert.maneuver.kernels
