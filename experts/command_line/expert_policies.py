@@ -33,6 +33,7 @@ def owns_policy(policy: str) -> bool:
 
 def load_policy(policy: str, start: Start, console: Console, seed: int | None, trust: bool) -> Pilot:
     """Solve the maneuver from a start, or read its solution, which holds no code."""
+    from dq_space_arm_env import compile_scene
     from dq_space_arm_env.command_line.simulated_episode import Pilot
     from dq_space_arm_env.environment.rollouts import StateFeedback
     from dq_space_arm_env.scene import StateLayout
@@ -53,8 +54,7 @@ def load_policy(policy: str, start: Start, console: Console, seed: int | None, t
     else:
         label, solution = Path(policy).stem, _read(Path(policy), start.scene)
     follow = solution.policy(start.scene)
-    # Without parameters, the solution was made with constants.
-    stages = solution.parameters if solution.parameters.size else [None] * len(solution.controls)
+    stages = compile_scene(start.scene).stage_parameters(start.parameters)
     acting = StateFeedback(lambda states, step: layout.to_action(follow(states[0], step), stages[step])[None])
     return Pilot(label, acting)
 

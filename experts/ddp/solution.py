@@ -329,8 +329,9 @@ class FeedbackPolicy:
                 f"the problem needs gains {expected} and states ({horizon + 1}, {problem.n_states})"
             )
         self._solution, self._problem = solution, problem
-        # Limits may be among the parameters; without any, the solution was made with constants.
-        with problem.parameters.being(solution.parameters if solution.parameters.size else None):
+        # Limits may be among the parameters; one that has others was made with constants in their place.
+        same = solution.parameters.shape == problem.parameters.rows.shape
+        with problem.parameters.being(solution.parameters if same else None):
             self._lower, self._upper = stage_bounds(problem)
         self._rates = rate_limits(problem)
         self._difference = problem.kernel("difference")

@@ -170,6 +170,30 @@ def test_solutions_fly_as_planned(solved: Path, scene_file: str, capsys: pytest.
 
 
 @pytest.mark.slow
+def test_a_solution_flies_in_its_scene_where_phases_change_and_episodes_draw_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its file has what the phases change alone: what was drawn is constant in it."""
+    coasting = {"name": "coasting", "steps": 8, "changes": {"actuators": {"base_force": None}}}
+    scene = {
+        "name": "coasting",
+        "base": {"motion": "planar", "mass": 20.0, "inertia": [1.0, 1.0, 1.0]},
+        "actuators": {"base_force": {"limit": 1.0}, "base_torque": {"limit": 1.0}},
+        "target": {"pose": {"rotation": {"axis": [0, 0, 1], "angle": 60}}},
+        "simulation": {"steps": 16, "dt": 0.1},
+        "phases": [{"name": "moving", "steps": 8}, coasting],
+        "spread": {"target_position": 0.5, "base_inertia": 0.3},
+    }
+    file, out = str(tmp_path / "coasting.yaml"), tmp_path / "out"
+    load_scene(scene).to_yaml(file)
+    main(["solve", file, "--seed", "3", "--solver", "box", "--out", str(out)])
+    cost = json.loads((out / "summary.json").read_text())["cost"]
+    capsys.readouterr()
+    assert main(["simulate", file, "--seed", "3", "--policy", f"{out}/solution.npz", "--json"]) == SUCCESS
+    assert documents(capsys)["cost"] == pytest.approx(cost, rel=1e-9)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [0.0, 2e4])
 def test_catches_are_judged_as_environments_judge_them(stiffness: float) -> None:
     """Each error a little within its tolerance, then beyond it, of a target that tumbles.
