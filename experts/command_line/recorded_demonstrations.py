@@ -21,6 +21,8 @@ def read_demonstration(source: str, label: str | None) -> Trajectory | None:
     try:
         demonstrations = load_demonstrations(Path(folder))
         last = len(demonstrations) - 1
+        if last < 0:
+            raise ValueError(f"{folder} holds no demonstration: all of its problems failed")
         if not number.isdecimal() or int(number) > last:
             raise ValueError(f"{folder}: there is no demonstration {number!r}; the last one is {last}")
         demonstration, scene = demonstrations[int(number)], demonstrations.scene

@@ -15,6 +15,7 @@ from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.environment.rollouts import Rollout
 from experts import generate_demonstrations, load_demonstrations
+from experts.command_line.recorded_demonstrations import read_demonstration
 from experts.demonstrations import Demonstrations, SerialExecutor, shard
 from experts.demonstrations import facts as tables
 from experts.demonstrations.data_card import MEANINGS, data_card
@@ -161,7 +162,7 @@ def test_errors_of_failed_starts_are_those_at_a_reset(failing: Demonstrations):
         assert errors == pytest.approx([info["attitude_error"], info["position_error"]], rel=1e-9)
 
 
-def test_a_data_set_without_demonstrations_has_a_page(
+def test_a_data_set_without_demonstrations_has_a_page_and_no_flight(
     quick_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(shard, "REPLAY_TOLERANCE", -1.0)
@@ -172,6 +173,8 @@ def test_a_data_set_without_demonstrations_has_a_page(
     page = (tmp_path / "summary" / "summary.html").read_text(encoding="utf-8")
     assert "There are no demonstrations: all 2 problems failed." in page
     assert "There are no demonstrations." in (tmp_path / "README.md").read_text(encoding="utf-8")
+    with pytest.raises(ValueError, match="holds no demonstration: all of its problems failed"):
+        read_demonstration(str(tmp_path), None)
 
 
 def test_what_should_not_be_stands_at_the_top(facts: Facts):
