@@ -109,9 +109,9 @@ class Maneuver:
         layout = StateLayout.of(self.scene)
         weights = self._in_steps(layout.control.weights, layout.control_weight)
         limits = self._in_steps(layout.control.limits, layout.control_limit)
-        limits = np.where(limits > 0.0, limits, layout.control_limit)  # out of work is not at a limit
         least = layout.lower_limits(limits)
         at_limit = (self.controls >= _AT_LIMIT * limits) | (self.controls <= _AT_LIMIT * least)
+        at_limit &= limits > 0.0  # out of work is not at a limit
         histories = []
         for name in CONTROL_UNITS:
             entries = getattr(layout.control, name)

@@ -126,6 +126,18 @@ def test_an_actuator_out_of_work_is_at_no_limit() -> None:
     assert [actuator.clamped_share for actuator in still.actuators] == [0.0] * len(still.actuators)
 
 
+def test_thrusters_out_of_work_are_at_no_limit_and_closed_ones_at_their_least() -> None:
+    closed = {"name": "closed", "steps": 1, "changes": {"actuators": {"thrusters": None}}}
+    scene = load_scene("thrusters").replace(
+        {"simulation.steps": 3, "phases": [{"name": "open", "steps": 2}, closed]}
+    )
+    layout = StateLayout.of(scene)
+    maneuver = Maneuver(scene, np.tile(layout.initial_state, (4, 1)), np.zeros((3, layout.n_u)))
+    jets = maneuver.actuator("thruster_force")
+    assert jets is not None
+    assert jets.at_limit.all(axis=1).tolist() == [True, True, False]
+
+
 def test_absent_actuators_are_left_out(short_run: ManeuverRun) -> None:
     assert [actuator.name for actuator in short_run.maneuver.actuators] == ["base_torque", "joint_torque"]
     assert short_run.maneuver.actuator("base_force") is None
