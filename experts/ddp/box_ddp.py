@@ -19,7 +19,7 @@ overestimates counts as converged.
 
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,6 +107,12 @@ class BoxDDP:
         if constraints is not None:
             self._constrained = MultiplierMethod(self._work, constraints, self._directions)
         self._shooting: MultipleShooting | None = None
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a BoxDDP cannot be copied or pickled, its machine code and work arrays are its own: make "
+            "another one of the same scene or problem"
+        )
 
     def solve(
         self,

@@ -14,7 +14,7 @@ reaches the target. Kernels with constraints are compiled for the first start th
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Self, cast
+from typing import Any, NoReturn, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -136,6 +136,12 @@ class GuidedDDP:
             self._coarsening = checked_factors(coarsening, self.problem)
             if self._coarsening:
                 self._coarse = self.in_long_steps(self._coarsening)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a GuidedDDP cannot be copied or pickled, its machine code and work arrays are its own: make "
+            "another one of the same scene or problem, with the same library"
+        )
 
     @property
     def library(self) -> tuple[Solution, ...]:

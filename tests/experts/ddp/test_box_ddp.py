@@ -1,5 +1,7 @@
 """Box-DDP on problems whose solution is known, and its answers to bad input and bad luck."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ from experts.ddp.backward_pass import PASS_COMPLETED
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.second_order import LARGEST_MU
 from experts.ddp.solution import StopReason
+from experts.guesses.guided import GuidedDDP
 
 
 def solve_condensed(system, limit, initial_state=None):
@@ -455,3 +458,10 @@ def test_input_without_a_weight_is_refused(pendulum):
     free = replace(pendulum, cost_derivatives=lambda x, u: (*derivatives(x, u)[:3], np.zeros((1, 1))))
     with pytest.raises(ValueError, match="input 0 at stage 0; every input needs a positive weight"):
         BoxDDP(free).solve()
+
+
+@pytest.mark.parametrize("solver", [BoxDDP, GuidedDDP])
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_solvers_share_their_work_arrays_with_nobody(pendulum, solver, duplicate):
+    with pytest.raises(TypeError, match=r"cannot be copied or pickled, .* make another one of the same"):
+        duplicate(solver(pendulum))
