@@ -20,6 +20,7 @@ from dq_space_arm_env.scene.constraint_rows import (
     path_rows,
     penalized_rows,
     rates_of,
+    slew_limits,
     terminal_rows,
 )
 from dq_space_arm_env.scene.constraints import ControlRate
@@ -237,9 +238,22 @@ class ArmProblem:
         return self.kernels.layout.lower_limits(self.control_upper)
 
     def limits(self, parameters: StageParameters) -> FloatArray:
-        """Limits of the inputs with given parameters of M stages, shape (n_u,) or (M, n_u)."""
+        """Limits of the inputs with given parameters of M stages, shape (n_u,) or (M, n_u).
+
+        Where a rate is limited and the environment switches off at once, they come down in time.
+        """
         layout = self.kernels.layout
-        return layout.limits_with(parameters.rows[:-1]) if self._limits_vary else layout.control_limit
+        if not self._limits_vary:
+            return layout.control_limit
+        limits, slewing = layout.limits_with(parameters.rows[:-1]), slew_limits(self.scene)
+        for control, change in zip(self.rate_limits.controls, self.rate_limits.change, strict=True):
+            if control in [each.control for each in slewing]:
+                continue  # it runs down in the environment, too
+            # Before a smaller limit a control has to be so near that its rate leads it there in time.
+            own, way = limits[:, control], change * np.arange(len(limits))
+            later = np.minimum.accumulate((own + way)[::-1])[::-1]
+            limits[:, control] = np.where(later < own + way, later - way, own)
+        return limits
 
     @property
     def target(self) -> FloatArray:

@@ -105,24 +105,45 @@ def test_wheels_and_thrusters_keep_to_their_rates(name, rates):
     assert solution.controls[:, solver.problem.kernels.layout.control.thruster_force].min(initial=0.0) >= 0.0
 
 
-@pytest.mark.slow
-def test_controls_that_run_down_where_a_phase_switches_them_off_are_a_guess():
-    """Their rates keep them out of limits of zero for some stages."""
+def closed_in_time(torque, constraints=()):
+    """A wheel's torque that the second of two phases switches off."""
     coasting = {"name": "coasting", "steps": 12, "changes": {"actuators": {"base_torque": None}}}
-    scene = load_scene(
+    return load_scene(
         {
-            "name": "wheel that runs down",
+            "name": "wheel that is switched off",
             "base": {"motion": "planar", "mass": 20.0, "inertia": [1.0, 1.0, 1.0]},
-            "actuators": {"base_torque": {"limit": 1.0, "slew_limit": 2.0}},
+            "actuators": {"base_torque": {"limit": 1.0, **torque}},
             "target": {"pose": {"rotation": {"axis": [0, 0, 1], "angle": 60}}},
             "simulation": {"steps": 24, "dt": 0.1},
             "phases": [{"name": "turning", "steps": 12}, coasting],
+            "constraints": constraints,
         }
     )
-    solver = BoxDDP(scene)
+
+
+@pytest.mark.slow
+def test_controls_that_run_down_where_a_phase_switches_them_off_are_a_guess():
+    """Their rates keep them out of limits of zero for some stages."""
+    solver = BoxDDP(closed_in_time({"slew_limit": 2.0}))
     solution = solver.solve()
     assert solution.controls[12, 0] != 0.0
     assert solver.solve(u_init=solution.controls).iterations == 0
     solution.controls[13] = 0.5
     with pytest.raises(ValueError, match=r"u_init\[13, 0\] is 0\.5, outside \[-0\.0, 0\.0\]"):
         solver.solve(u_init=solution.controls)
+
+
+@pytest.mark.slow
+def test_controls_of_limited_rates_are_zero_when_a_phase_switches_them_off():
+    """The environment switches off at once, and charges the jump that a control has not prepared."""
+    scene = closed_in_time({}, [{"kind": "control_rate", "name": "rate", "base_torque": 2.0}])
+    solution, env = BoxDDP(scene).solve(), DQSpaceArmEnv(scene)
+    env.reset(options={"nominal": True})
+    cost, charge = 0.0, 0.0
+    for action in solution.controls:  # the limit is 1 N m
+        _, reward, *_, info = env.step(action)
+        cost, charge = cost - reward, charge + info["cost"]
+    assert np.abs(solution.controls[11, 0]) == pytest.approx(0.2, rel=1e-9)
+    assert np.abs(solution.controls[12:]).max() <= 1e-12
+    assert cost == pytest.approx(solution.cost, rel=1e-12)
+    assert charge <= 1e-12
