@@ -303,6 +303,7 @@ class Episodes:
         elif self._measured is not self._states:
             self._measured[k] = self._states[k]
 
+    @np.errstate(over="ignore", invalid="ignore")
     def gradient(
         self, starts: Array, mean: Array, scale: Array, emphasis: float
     ) -> tuple[list[Array], Array]:

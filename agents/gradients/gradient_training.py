@@ -211,10 +211,10 @@ class _Learner:
         return median
 
     def _fly(self, starts: Array) -> tuple[list[Array], float]:
-        """The gradient of episodes, and their median cost; infinite where all diverge."""
+        """The gradient of episodes, and their median cost; infinite where all diverge, or slopes overflow."""
         gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, self._end_weight)
-        finite = costs[np.isfinite(costs)]
-        return [*gradient], float(np.median(finite)) if len(finite) else math.inf
+        finite, is_sound = costs[np.isfinite(costs)], all(np.isfinite(each).all() for each in gradient)
+        return gradient, float(np.median(finite)) if len(finite) and is_sound else math.inf
 
     def _divide(self, median: float) -> bool:
         """Divide decisions whose integration errs too much, down to time steps; whether there were any.

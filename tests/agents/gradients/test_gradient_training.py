@@ -251,6 +251,26 @@ def test_unstable_motions_go_back_to_the_last_copy_but_one(small_file, small_sce
     assert fallback.rate == pytest.approx(1.001 * rate)
 
 
+def test_slopes_that_overflow_go_back_to_a_copy(small_file, small_scene):
+    """They would leave weights that are no numbers, and have no eigenbases."""
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    kept, exact = learner._fallback.kept.arrays["weight0"].copy(), learner._episodes.gradient
+
+    def overflowing(*given):
+        learner._episodes.gradient = exact  # the next ones do not
+        gradient, costs = exact(*given)
+        gradient[0][:] = np.inf
+        return gradient, costs
+
+    learner._episodes.gradient = overflowing
+    learner._weights[0][:] += 0.1
+    learner._update()
+    np.testing.assert_array_equal(learner._weights[0], kept)
+    assert learner._fallback.rate < 1.0
+    learner._update()
+    assert not np.array_equal(learner._weights[0], kept)
+
+
 @pytest.mark.parametrize("what", ["costs", "misses"])
 def test_what_drifts_goes_back_to_a_copy(small_file, small_scene, what):
     learner = gradient_training._Learner(settings(small_file), small_scene)
