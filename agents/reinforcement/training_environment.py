@@ -97,8 +97,9 @@ def _check_lengths(configuration: c.Configuration, scene: Scene) -> None:
     if not isinstance(algorithm, c.OffPolicy) or algorithm.hindsight is None:
         return
     episodes = practice.copies * configuration.decisions(steps)
-    if algorithm.learning_starts < episodes:
-        raise c.ConfigurationError(
-            f"algorithm.learning_starts = {algorithm.learning_starts}: must be at least {episodes}, one "
-            "episode of each copy; there is no hindsight before that"
-        )
+    for name, least, why in (
+        ("learning_starts", episodes, "one episode of each copy; there is no hindsight before that"),
+        ("buffer_size", 2 * episodes, "two episodes of each copy; the running one has no hindsight yet"),
+    ):
+        if (value := getattr(algorithm, name)) < least:
+            raise c.ConfigurationError(f"algorithm.{name} = {value}: must be at least {least}, {why}")

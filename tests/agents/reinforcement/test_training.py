@@ -404,6 +404,12 @@ def test_a_run_whose_time_is_up_where_it_evaluates_does_so_once(scene_file, tmp_
     [
         ("PPO", "environment", {"action_repeat": STEPS + 1}, "action_repeat = 41: must be at most 40"),
         ("HER", "algorithm", {"learning_starts": 39}, "algorithm.learning_starts = 39: must be at least 40"),
+        (
+            "HER",
+            "algorithm",
+            {"learning_starts": 40, "buffer_size": 79},
+            "algorithm.buffer_size = 79: must be at least 80, two",
+        ),
     ],
 )
 def test_lengths_that_do_not_fit_the_scene_are_named(algorithm, part, changes, sentence, scene_file):
