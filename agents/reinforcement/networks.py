@@ -15,7 +15,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
@@ -161,8 +161,13 @@ def export_policy(
 def _layers(model: BaseAlgorithm) -> tuple[list[nn.Module], str]:
     """The actor's modules in order, and how its outputs are squashed."""
     policy: Any = model.policy
+    if hasattr(policy, "lstm_actor"):
+        raise ValueError(
+            f"{type(policy).__name__} has a memory, which arrays cannot hold: fly the model itself"
+        )
     if isinstance(policy, ActorCriticPolicy):
-        return [*policy.mlp_extractor.policy_net, policy.action_net], "clip"
+        is_squashed = policy.squash_output and not isinstance(policy, ScaledActionsPolicy)
+        return [*policy.mlp_extractor.policy_net, policy.action_net], "tanh" if is_squashed else "clip"
     actor: Any = getattr(policy, "actor", None)
     if hasattr(actor, "latent_pi"):  # SAC, TQC
         return [*actor.latent_pi, actor.mu], "tanh"
@@ -190,4 +195,8 @@ def _units(model: BaseAlgorithm, n_observation: int) -> tuple[NDArray[np.float64
     extractor = getattr(policy, "actor", policy).features_extractor
     if isinstance(extractor, ScaledObservations):
         return extractor.mean.double().numpy(), extractor.scale.double().numpy()
+    if type(extractor) not in (FlattenExtractor, CombinedExtractor):
+        raise ValueError(
+            f"observations go through {type(extractor).__name__}, which arrays lack: fly the model itself"
+        )
     return np.zeros(n_observation), np.ones(n_observation)

@@ -14,7 +14,9 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
 import torch
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from agents import DQSpaceArmVecEnv, ExportedPolicy, evaluate
 from agents.configuration import ConfigurationError, load_configuration
@@ -447,10 +449,24 @@ def test_models_folders_and_exports_fly_alike(algorithm, trained, scene_file):
     np.testing.assert_array_equal(costs[2], costs[3])
 
 
-def test_what_the_arrays_cannot_hold_is_not_exported():
-    env = DQSpaceArmVecEnv(2, PAPER)
-    odd = PPO("MlpPolicy", env, device="cpu", policy_kwargs={"activation_fn": torch.nn.ELU})
-    with pytest.raises(ValueError, match="activations ELU"):
+class Doubled(FlattenExtractor):
+    """Observations that are not what they were."""
+
+    def forward(self, observations):
+        return 2.0 * super().forward(observations)
+
+
+@pytest.mark.parametrize(
+    ("kind", "policy", "options", "message"),
+    [
+        (PPO, "MlpPolicy", {"activation_fn": torch.nn.ELU}, "activations ELU"),
+        (PPO, "MlpPolicy", {"features_extractor_class": Doubled}, "observations go through Doubled"),
+        (RecurrentPPO, "MlpLstmPolicy", {}, "RecurrentActorCriticPolicy has a memory"),
+    ],
+)
+def test_what_the_arrays_cannot_hold_is_not_exported(kind, policy, options, message):
+    odd = kind(policy, DQSpaceArmVecEnv(2, PAPER), device="cpu", policy_kwargs=options)
+    with pytest.raises(ValueError, match=message):
         export_policy(odd, {})
 
 
@@ -461,6 +477,20 @@ def test_a_plain_model_of_stable_baselines3_is_exported_and_evaluated(tmp_path):
     np.testing.assert_allclose(export_policy(model, {})(joined), expected, rtol=0.0, atol=1e-6)
     model.save(tmp_path / "model.zip")
     np.testing.assert_allclose(as_policy(tmp_path / "model.zip").act(joined), expected, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("squash", [False, True])
+def test_actions_under_state_dependent_exploration_are_exported(squash):
+    """Those that are squashed, too."""
+    options = {"squash_output": squash}
+    model = PPO(
+        "MlpPolicy", DQSpaceArmVecEnv(2, PAPER), device="cpu", seed=0, use_sde=True, policy_kwargs=options
+    )
+    with torch.no_grad():
+        model.policy.action_net.bias.fill_(0.5)
+    seen, joined = observations(model)
+    expected = model.predict(seen, deterministic=True)[0]
+    np.testing.assert_allclose(export_policy(model, {})(joined), expected, rtol=0.0, atol=1e-6)
 
 
 def test_the_command_trains_and_names_what_is_wrong(scene_file, tmp_path, capsys, monkeypatch):
