@@ -208,27 +208,42 @@ def _predictor(model: Any, statistics: ObservationStatistics | None) -> Policy |
         except NeedsCodeError as error:
             raise PolicyError(f"policy: {error}") from error
 
+    memory: dict[str, Any] = {}  # of a recurrent network; others have none
+
+    def forget(environment: DQSpaceArmVectorEnv) -> None:
+        memory.clear()
+
     def act(observations: Any) -> NDArray[Any]:
         if statistics is not None:
             observations = statistics.normalize(observations)
-        actions = np.asarray(model.predict(observations, deterministic=True)[0])
+        chosen, state = model.predict(observations, deterministic=True, **memory)
+        if state is not None:
+            memory["state"] = state
+        actions = np.asarray(chosen)
         return actions if factors is None else actions * factors
 
     if hasattr(getattr(model, "observation_space", None), "spaces"):
-        return _on_goals(act, joined=False)
+        return _on_goals(act, joined=False, forget=forget)
 
     def act_in_single_precision(observations: NDArray[Any]) -> NDArray[Any]:
         return act(observations.astype(np.float32))  # as in training
 
+    vars(act_in_single_precision)["begin"] = forget
     return act_in_single_precision
 
 
-def _on_goals(act: Callable[[Any], NDArray[Any]], *, joined: bool) -> StateFeedback:
+def _on_goals(
+    act: Callable[[Any], NDArray[Any]],
+    *,
+    joined: bool,
+    forget: Callable[[DQSpaceArmVectorEnv], None] = lambda environment: None,
+) -> StateFeedback:
     """A policy of the goal environment, flown in the ordinary one; it sees measured states, as others do."""
     flown_in: list[DQSpaceArmVectorEnv] = []
 
     def begin(environment: DQSpaceArmVectorEnv) -> None:
         flown_in[:] = [environment]
+        forget(environment)
 
     def act_on_states(states: NDArray[np.float64], step: int) -> NDArray[Any]:
         (environment,) = flown_in

@@ -14,13 +14,14 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
 import torch
-from sb3_contrib import TQC
+from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from agents import DQSpaceArmVecEnv, ExportedPolicy
 from agents.zoo.finding import PolicyError, as_policy
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.environment.rollouts import rollout
 
 pytestmark = pytest.mark.agents
 
@@ -128,6 +129,26 @@ def test_a_model_that_needs_its_code_is_refused_without_trust(verb, own, small_f
 def test_trust_flies_a_model_by_its_code(verb, own, small_file, tmp_path):
     words = [str(word) for word in verbs(own, small_file, tmp_path)[verb]]
     assert main([*words, "--trust"]) == 0
+
+
+@pytest.mark.parametrize("kind", ["model", "file"])
+def test_a_recurrent_model_remembers_its_flight(kind, small_scene, tmp_path):
+    """And forgets it when the next one begins."""
+    model = RecurrentPPO("MlpLstmPolicy", DQSpaceArmVecEnv(2, small_scene), device="cpu", seed=0)
+    for parameter in model.policy.parameters():
+        torch.nn.init.uniform_(parameter, -0.3, 0.3)
+    model.save(tmp_path / "model.zip")
+    memory = None
+
+    def remembering(seen):
+        nonlocal memory
+        action, memory = model.predict(seen.astype(np.float32), state=memory, deterministic=True)
+        return action
+
+    expected = rollout(remembering, small_scene, [1, 2]).cost
+    acting = as_policy(model if kind == "model" else tmp_path / "model.zip", trust=True)
+    for _ in range(2):
+        np.testing.assert_array_equal(rollout(acting.act, small_scene, [1, 2]).cost, expected)
 
 
 def test_nothing_is_executed_from_python_either(plain, own, tmp_path):
