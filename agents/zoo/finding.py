@@ -315,7 +315,13 @@ def _load_model(path: Path) -> Any:
     options: dict[str, Any] = {}
     if learner is not PPO:
         options = {"buffer_size": 1, "replay_buffer_class": None, "replay_buffer_kwargs": {}}
-    return learner.load(path, device="cpu", **options)
+    try:
+        return learner.load(path, device="cpu", **options)
+    except Exception as error:  # of other algorithms, or of the code in the file
+        raise PolicyError(
+            f"{path}: {learner.__name__}.load fails on it ({type(error).__name__}: {error}): load it by its "
+            "own class in Python, and give the model"
+        ) from error
 
 
 def _lacking(path: Path, error: ModuleNotFoundError) -> ImportError:

@@ -14,7 +14,7 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
 import torch
-from sb3_contrib import TQC, RecurrentPPO
+from sb3_contrib import TQC, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.policies import ActorCriticPolicy
 
@@ -129,6 +129,12 @@ def test_a_model_that_needs_its_code_is_refused_without_trust(verb, own, small_f
 def test_trust_flies_a_model_by_its_code(verb, own, small_file, tmp_path):
     words = [str(word) for word in verbs(own, small_file, tmp_path)[verb]]
     assert main([*words, "--trust"]) == 0
+
+
+def test_a_trusted_model_of_an_algorithm_that_is_not_known_is_refused_in_a_sentence(small_scene, tmp_path):
+    learner(CrossQ, small_scene).save(tmp_path / "model.zip")
+    with pytest.raises(PolicyError, match=r"SAC\.load fails on it .*: load it by its own class in Python"):
+        as_policy(tmp_path / "model.zip", trust=True)
 
 
 @pytest.mark.parametrize("kind", ["model", "file"])
