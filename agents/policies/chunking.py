@@ -113,6 +113,12 @@ class ChunkingPolicy:
         _check(self)
         self._doubles = {name: array.astype(np.float64) for name, array in self.tensors.items()}
 
+    def __repr__(self) -> str:
+        chunk, width = self.tensors["positions"].shape
+        trained = f", trained in {self.metadata['scene']!r}" if "scene" in self.metadata else ""
+        sizes = f"{self.n_observation} -> {width} -> {self.n_action}"
+        return f"<ChunkingPolicy {sizes}, {chunk} actions, {self.activation}{trained}>"
+
     @property
     def n_observation(self) -> int:
         """Number of entries of an observation."""

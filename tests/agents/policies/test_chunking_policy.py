@@ -55,6 +55,11 @@ def test_a_policy_stays_what_it_was_when_the_arrays_that_it_was_made_of_change(t
     )
 
 
+def test_a_policy_is_shown_by_its_sizes():
+    shown = "<ChunkingPolicy 7 -> 8 -> 3, 4 actions, silu, trained in 'paper'>"
+    assert repr(ChunkingPolicy(**parts())) == shown
+
+
 @pytest.mark.parametrize("weighting", [0.0, 0.2, -0.3])
 def test_an_action_is_the_weighted_mean_of_all_predictions_of_it(weighting):
     rng = np.random.default_rng(2)
