@@ -61,6 +61,12 @@ LAYER_NORMALIZED: Mapping[str, type[BasePolicy]] = {
 }
 
 
+def _remaining(model: OffPolicyAlgorithm) -> float:
+    """Share of the schedule that is left."""
+    # Negative where the copies gather more decisions before the last update than the schedule has left.
+    return max(model._current_progress_remaining, 0.0)
+
+
 class FallingEntropy(OffPolicyAlgorithm):
     """A maximum-entropy algorithm whose target entropy goes linearly to `final_target_entropy`, if given."""
 
@@ -79,7 +85,7 @@ class FallingEntropy(OffPolicyAlgorithm):
         super()._update_learning_rate(optimizers)
         if self.final_target_entropy is not None:
             first, last = self.first_target_entropy, self.final_target_entropy
-            self.target_entropy = last + (first - last) * self._current_progress_remaining
+            self.target_entropy = last + (first - last) * _remaining(self)
             self.logger.record("train/target_entropy", self.target_entropy)
 
 
@@ -101,9 +107,7 @@ class TwinDelayed(TD3):
     def deviation(self) -> float:
         """Current standard deviation of the noise, in action scales."""
         first, last = self.deviations
-        # Negative where the copies gather more decisions before the last update than the schedule has left.
-        remaining = max(self._current_progress_remaining, 0.0)
-        deviation: float = last + (first - last) * remaining
+        deviation: float = last + (first - last) * _remaining(self)
         return deviation
 
     def _sample_action(

@@ -197,13 +197,17 @@ def test_a_run_resumes_with_optimizer_and_buffer(algorithm, trained, scene_file,
 
 @pytest.mark.sampled
 @pytest.mark.parametrize("algorithm", ["SAC", "TQC"])
-def test_the_target_entropy_goes_linearly_to_its_end(algorithm, trained):
+def test_the_target_entropy_goes_linearly_to_its_end(algorithm, trained, monkeypatch):
     model = trained(algorithm).model
     done = model.num_timesteps / 800  # decisions
     assert done > 0.95
     # The last update follows the last decision of all copies.
     assert model.target_entropy == pytest.approx(3.0 - 12.0 * done, abs=1e-9)
     assert trained("HER").model.target_entropy == -model.action_space.shape[0]
+    monkeypatch.setattr(model, "target_entropy", model.target_entropy)  # put back afterwards, as the next
+    monkeypatch.setattr(model, "_current_progress_remaining", -0.6)  # beyond the schedule
+    model._update_learning_rate([])
+    assert model.target_entropy == -9.0
 
 
 @pytest.mark.sampled
