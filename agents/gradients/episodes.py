@@ -34,6 +34,7 @@ from agents.gradients.penalties import Penalties
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall, address_of
 from dq_space_arm_env.kernels.library import PENALIZED
+from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 from experts.problems.arm_problem import misses
 
@@ -57,9 +58,12 @@ def decision_times(scene: Scene, decisions: int, crowding: float) -> Array:
     """Times of decisions and end, s, (K + 1,); closer at both ends by a share of a cosine's spacing.
 
     Every phase has its share of them; before another one its last decision is a single time step, as the sum
-    of costs has it.
+    of costs has it. Actuators that delay by whole time steps have one for each of these, however many are
+    asked for: in a longer one they would delay longer.
     """
     dt, steps = scene.simulation.dt, scene.simulation.steps
+    if any(chain.delay for chain in StateLayout.of(scene).chains):
+        return every_step(scene)
     starts = scene.staged.starts if scene.phases else (0,)
     times = [np.zeros(1)]
     for start, end in pairwise((*starts, steps)):
@@ -72,6 +76,11 @@ def decision_times(scene: Scene, decisions: int, crowding: float) -> Array:
         spread = (end - single - start) * dt * (even + crowding * (ends - even))
         times += [start * dt + spread[1:], *([np.array([end * dt])] if single else [])]
     return np.concatenate(times)
+
+
+def every_step(scene: Scene) -> Array:
+    """Times of all time steps and of the end, s, (N + 1,)."""
+    return scene.simulation.dt * np.arange(scene.simulation.steps + 1)
 
 
 def first_decisions(scene: Scene, times: Array) -> list[int]:

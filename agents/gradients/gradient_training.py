@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from agents.configuration.gradients import GradientConfiguration
 from agents.gradients.disturbed_flights import Met, calm
-from agents.gradients.episodes import Episodes, decision_times
+from agents.gradients.episodes import Episodes, decision_times, every_step
 from agents.gradients.fallback import LEAST_RATE, Fallback
 from agents.gradients.first_units import first_units
 from agents.gradients.layers import Layers, random_weights
@@ -100,6 +100,7 @@ class _Learner:
         self._settings, self._configuration, self._scene = configuration.algorithm, configuration, scene
         settings, rng = configuration.algorithm, np.random.default_rng(configuration.seed)
         self._times = decision_times(scene, settings.decisions, settings.crowding)
+        self._decisions = len(self._times) - 1  # until those of every time step
         self._mismatch = configuration.mismatch
         self._flown, self._starts = self._drawn(settings.starts)
         self._mean, self._scale, units = first_units(scene, self._times, rng, configuration.seed)
@@ -129,8 +130,8 @@ class _Learner:
 
     def _decide_at_every_step(self) -> None:
         """Go on as in flight: what violates a constraint for a moment may do so between decisions."""
-        simulation, before = self._scene.simulation, self._episodes
-        self._times = simulation.dt * np.arange(simulation.steps + 1)
+        before = self._episodes
+        self._times = every_step(self._scene)
         self._episodes = self._begin_episodes(before.units)
         self._episodes.follow_on(before)
         self._fallback.forget_costs()
@@ -267,7 +268,7 @@ class _Learner:
     def effort(self) -> dict[str, Any]:
         """What the training has taken; an environment step is one between decisions."""
         at_every_step = max(0, self._updates - self._every_step_from)
-        decided = (self._updates - at_every_step) * self._settings.decisions
+        decided = (self._updates - at_every_step) * self._decisions
         decided += at_every_step * self._scene.simulation.steps
         solves, seconds = self._before
         spent = {"expert_solves": solves, "seconds": round(seconds + self._seconds, 3)}

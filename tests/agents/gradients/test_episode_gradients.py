@@ -364,6 +364,18 @@ def test_decisions_fly_as_at_every_time_step(case):
     assert errors[2] < 0.35 * errors[1]  # not so if actions were not half a time step old
 
 
+def test_actuators_delay_by_whole_time_steps(small_scene):
+    """Each of which is a decision, however many are asked for."""
+    delay = {f"actuators.{name}.delay": steps for name, steps in (("joint_torque", 5), ("base_force", 3))}
+    delayed = small_scene.replace({"name": "delayed", **delay})
+    steps = delayed.simulation.steps
+    even = decision_times(small_scene, steps, 0.0)
+    np.testing.assert_allclose(decision_times(delayed, 20, 0.4), even, rtol=0, atol=1e-12)
+    flown = Flown(delayed, steps)
+    flights = rollout(flown.policy(), delayed, SEEDS)
+    np.testing.assert_allclose(flown.costs(), flights.cost, rtol=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("coast", [2, 10])
 def test_phases_shorter_than_a_share_of_decisions_count_in_full(coast):
