@@ -4,7 +4,7 @@ A row has one multiplier for all episodes. The slopes of an episode's cost are t
 Lagrangian of `task.augmented_lagrangian`. A policy has to keep to a row from all starts: dual ascent lets the
 price of a violation rise while too many episodes have one, however large, and else fall. Since the penalty is
 a barrier inside, a higher price keeps flights at a larger distance. Rates of controls, and what is exact at
-the end, have no penalty, nor have the torques of motors at speed, to which environments clip.
+the end, have no penalty, nor have slew limits and the torques of motors at speed, to which environments clip.
 """
 
 from __future__ import annotations
