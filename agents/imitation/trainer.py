@@ -216,6 +216,8 @@ class Trainer(Generic[N]):
         if validation is not None and record["validation_total"] < self._best:
             self._best = record["validation_total"]
             self._best_weights = copy.deepcopy(self._network.state_dict())
+        if validation is not None and self._is_done:
+            self._network.load_state_dict(self._best_weights)  # those that are kept are watched last
         if watch is not None:
             record |= watch(self._network, record, self._is_done)
         self.history.append(record)

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 from agents.configuration import Network  # noqa: E402
 from agents.configuration.imitation import Cloning  # noqa: E402
 from agents.imitation import Making, clone  # noqa: E402
-from agents.imitation.trainer import CHECKPOINT, CheckpointError  # noqa: E402
+from agents.imitation.trainer import CHECKPOINT, CheckpointError, Trainer  # noqa: E402
 from agents.policies.flying import fly  # noqa: E402
 from experts.demonstrations import DemonstrationsError  # noqa: E402
 
@@ -58,6 +58,19 @@ def test_it_learns(quick):
 def test_a_training_that_diverges_gives_no_policy(demonstrations):
     with pytest.raises(ValueError, match=r"losses are no longer finite; reduce optimization.learning_rate"):
         learn(demonstrations, cloning(learning_rate=1e18))
+
+
+def test_the_weights_that_are_kept_are_watched_last(demonstrations, monkeypatch):
+    """Those of the lowest validation loss: learning curves end with the policy that is exported."""
+    totals, watched = iter([3.0, 1.0, 2.0, 4.0]), []
+    monkeypatch.setattr(Trainer, "_validate", lambda *_: {"total": next(totals)})
+
+    def watch(network, record, is_last):
+        watched.append(network.export({}).weights[0])
+        return {}
+
+    kept = learn(demonstrations, watch=watch).export().weights[0]
+    assert [np.array_equal(each, kept) for each in watched] == [False, True, False, True]
 
 
 def test_equal_seeds_give_equal_weights(quick, demonstrations):
