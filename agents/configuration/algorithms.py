@@ -126,6 +126,8 @@ class OffPolicy(_Common):
     )
 
     def _problems(self) -> Iterator[Problem]:
+        if self.tau > 1.0:
+            yield Problem(("tau",), self.tau, "must be at most 1, where targets are the critics themselves")
         if self.learning_starts > self.buffer_size:
             yield Problem(
                 ("learning_starts",),

@@ -88,6 +88,7 @@ def test_unknown_keys_are_refused_with_a_suggestion():
         ({"algorithm": {"name": "SAC", "ent_coef": "autoo"}}, ".ent_coef = 'autoo': must be a finite"),
         ({"algorithm": {"name": "TQC", "ent_coef": 0.0}}, "must be a finite number greater than 0, or auto"),
         ({"algorithm": {"name": "SAC", "target_entropy": "x"}}, "must be a finite number, or auto ("),
+        ({"algorithm": {"name": "TD3", "tau": 1.5}}, "tau = 1.5: must be at most 1, where targets are"),
         (
             {"algorithm": {"name": "SAC", "buffer_size": 10, "learning_starts": 20}},
             "learning_starts = 20: must be at most buffer_size, which is 10",
