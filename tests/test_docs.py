@@ -97,12 +97,28 @@ def test_code_in_the_documentation_runs(page, number, tmp_path, monkeypatch, cap
     capsys.readouterr()
 
 
+def scene_files() -> list[tuple[str, str]]:
+    files = [(page, file) for page in PAGES for file in code_of(TEXTS[page], "yaml")]
+    return [(page, file) for page, file in files if re.search("^base:", file, flags=re.MULTILINE)]
+
+
 def test_scene_files_in_the_documentation_are_scenes():
-    files = code_of(TEXTS["scene"], "yaml")
-    assert files
-    for file in files:
+    assert {page for page, _ in scene_files()} == {"actuators", "maneuver", "scene"}
+    for _, file in scene_files():
         scene = dq_space_arm_env.load_scene(parse_yaml(file))
         assert scene.simulation.dt == 0.015
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "file"), scene_files())
+def test_the_expert_flies_scene_files_in_the_documentation_to_their_targets(page, file):
+    scene = dq_space_arm_env.load_scene(parse_yaml(file))
+    solution = experts.GuidedDDP(scene).solve()
+    env = dq_space_arm_env.DQSpaceArmEnv(scene)
+    env.reset(options={"nominal": True})
+    for action in env.kernels.layout.to_action(solution.controls):
+        *_, info = env.step(action)
+    assert info["is_success"]
 
 
 def test_suites_in_the_documentation_have_scenes_as_they_are():
