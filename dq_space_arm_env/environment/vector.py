@@ -273,11 +273,13 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             "target": (self.num_envs, 8),
             "parameters": self._envs.parameters.shape,
         }
-        each = {
-            name: options[name]
-            for name, shape in shapes.items()
-            if name in options and np.shape(options[name]) == shape
-        }
+        each = {name: options[name] for name in shapes if name in options and np.ndim(options[name]) == 2}
+        for name, values in each.items():
+            if np.shape(values) != (shape := shapes[name]):
+                raise ValueError(
+                    f"options: {name} of shape {np.shape(values)}, should be {shape[1:]} for all, or {shape} "
+                    "with a row for each sub-environment"
+                )
         if not each:
             return given_start(self.kernels, options)
         starts = [

@@ -113,3 +113,11 @@ def test_bad_targets_are_refused(scene, target, message):
     env = make(scene)
     with pytest.raises(ValueError, match=message):
         env.reset(options={"target": target})
+
+
+@pytest.mark.parametrize("rows", [2, 4])
+def test_too_few_or_too_many_rows_are_refused_with_the_shapes_that_fit(rows):
+    venv = gymnasium.make_vec("DQSpaceArm-v0", num_envs=3, scene="random-target")
+    message = rf"target of shape \({rows}, 8\), should be \(8,\) for all, or \(3, 8\) with a row for each"
+    with pytest.raises(ValueError, match=message):
+        venv.reset(options={"target": np.tile(TARGET, (rows, 1))})
