@@ -289,6 +289,8 @@ class Kernels(DerivativeKernels):
     def retract(self, x: ArrayLike, dx: ArrayLike) -> Array:
         """Move a state along tangent coordinates; the base pose moves by q exp(dx / 2).
 
+        All other entries are added to, also a spherical joint's quaternion: divide it by its length then.
+
         Args:
             x: States, shape (n_x,) or (B, n_x).
             dx: Tangent states, shape (n_t,) or (B, n_t).
