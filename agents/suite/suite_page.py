@@ -30,7 +30,7 @@ _SCORES = (
         COLUMNS["success_rate"],
     ),
     replace(COLUMNS["median_cost_gap"], key="interquartile_mean_cost_gap"),
-    Column("tail", "95th perc.\n%", lambda gap: f"{100.0 * gap:.3g}"),
+    Column("tail", "95th perc.\n%", lambda gap: percent((gap,))),
     *(COLUMNS["violating_episodes"], *_TIMES),
     Column("training_commits", "trained\nat", lambda hashes: ", ".join(each[:7] for each in hashes)),
 )

@@ -206,6 +206,13 @@ def test_the_page_tells_of_starts_without_an_optimum(content):
     assert page.markdown().count("a, training: 2 of 4 starts have no cost gap and count in no profile") == 1
 
 
+def test_percentiles_of_gaps_are_written_like_the_gaps_beside_them(content):
+    scores = (made([[True]], [[gap]], entrant=name) for name, gap in (("x", 2e-15), ("y", 66.3)))
+    page = suite_page(SuiteRun(Suite.model_validate(content), (*scores,), {"a": ""}, ()), picture=False)
+    assert "| 0.0 | 0.0 |" in page.markdown()
+    assert "| 6,630 | 6,630 |" in page.markdown()
+
+
 def test_scores_of_one_flight_are_compared_without_an_interval_of_the_gap(content, tmp_path):
     suite, file = Suite.model_validate(content), tmp_path / "theirs.json"
     run, other = (SuiteRun(suite, (made([[True]], [[gap]]),), {"a": ""}, ()) for gap in (0.01, 0.02))
