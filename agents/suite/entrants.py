@@ -14,6 +14,7 @@ from agents.suite.tasks import ZOO, Suite, SuiteError
 from agents.zoo.finding import ActingPolicy, PolicyError, as_policy, check_fit, policy_path
 from agents.zoo.shelf import list_policies, load_policy
 from dq_space_arm_env import Scene
+from dq_space_arm_env.validation import did_you_mean
 
 TASK = "{task}"
 """In the path of a policy: the name of a task."""
@@ -55,6 +56,8 @@ def sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[s
             controllers.append(entrant)
         elif entrant in (*suite.agents, *list_configurations()) or entrant.endswith((".yaml", ".yml")):
             agents.append(entrant)
+        elif entrant == ZOO:
+            files[ZOO] = ZOO
         else:
             named = _NAMED.fullmatch(entrant)
             name, path = (named[1], named[2]) if named else (entrant, entrant)
@@ -62,6 +65,12 @@ def sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[s
                 raise SuiteError(f"{entrant}: {ZOO} is the policies that ship: put another name before the =")
             if name in files:
                 raise SuiteError(_ONE_NAME.format(name))
+            try:
+                policy_path(path)
+            except PolicyError as error:
+                known = dict.fromkeys([*CONTROLLERS, *suite.agents, *list_configurations(), ZOO])
+                advice = did_you_mean(path, known, f"choose from {', '.join(known)}, or give a path")
+                raise SuiteError(f"entrant: {path!r} is unknown; {advice}") from error
             files[name] = path
     return controllers, agents, files
 

@@ -105,8 +105,12 @@ def test_unknown_names_are_refused(content):
         run_suite(["gains"], suite, tasks=["nowhere"])
     with pytest.raises(TypeError, match="entrants: 'gains', should be a sequence: put it into a list"):
         run_suite("gains", suite)
-    with pytest.raises(PolicyError, match="zoo has no policy 'magic'"):
+    with pytest.raises(
+        SuiteError, match=r"entrant: 'magic' is unknown; choose from open-loop, gains, rec.*, apg, "
+    ):
         run_suite(["magic"], suite)
+    with pytest.raises(SuiteError, match=r"entrant: 'gainz' is unknown; did you mean 'gains'\?"):
+        run_suite(["gainz"], suite)
     with pytest.raises(SuiteError, match="there is no such file"):
         run_suite(["nowhere/{task}.npz"], suite)
     with pytest.raises(SuiteError, match="zoo: no policy that ships was trained in"):
