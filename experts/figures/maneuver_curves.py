@@ -192,7 +192,7 @@ def convergence_figure(
 
 def _stacked(rows: int, height: float = 1.5) -> tuple[Figure, list[Axes]]:
     """Panels in a column over the same time, with the same margins in all figures."""
-    left, right, below, above, between = 0.66, 0.08, 0.42, 0.27, 0.40  # inches
+    left, right, below, above, between = 0.66, 0.16, 0.42, 0.27, 0.40  # inches
     total = rows * height + (rows - 1) * between + below + above
     figure = Figure(figsize=(WIDTH, total))
     figure.subplots_adjust(

@@ -60,6 +60,18 @@ def test_figure_4_is_in_degrees_and_meters(paper_maneuver: Maneuver) -> None:
     assert upper.lines[1].get_ydata()[0] == 3.0  # the tolerance
 
 
+def test_a_number_at_the_end_of_the_time_axis_is_not_cut() -> None:
+    scene = load_scene("payload")  # 22.5 s
+    layout, steps = StateLayout.of(scene), scene.simulation.steps
+    states = np.tile(layout.initial_state, (steps + 1, 1))
+    with house_style():
+        figure = figure_4(Maneuver(scene, states, np.zeros((steps, layout.n_u))))
+        figure.draw_without_rendering()
+        last = figure.axes[-1].get_xticklabels()[-1]
+        assert last.get_text() == "22.5"
+        assert last.get_window_extent().x1 < figure.bbox.x1
+
+
 def test_figure_5_shows_small_forces_in_millinewtons(paper_maneuver: Maneuver) -> None:
     figure = figure_5(paper_maneuver)
     force, torque = figure.axes
