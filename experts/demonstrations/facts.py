@@ -202,6 +202,7 @@ def parameters(facts: Facts) -> TextTable:
         rows.append((name, unit, *(number(float(value)) for value in numbers)))
     headings = ("", "unit", "nominal", "least", "mean", "most")
     title = "Parameters\nwhat varies between problems besides the start"
+    title += "; and what phases change, as the first has it" if found.staged else ""
     return TextTable(title, headings, tuple(rows), right=2)
 
 

@@ -16,6 +16,8 @@ from experts.demonstrations import (
     export_to_lerobot,
     export_to_minari,
 )
+from experts.demonstrations.data_card import data_card
+from experts.demonstrations.facts import gather
 
 pytestmark = pytest.mark.slow
 
@@ -44,6 +46,12 @@ def made(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Demonstratio
     assert found is not None
     assert len(found) == COUNT
     return found
+
+
+def test_the_card_tells_what_phases_change_from_what_problems_do(made: Demonstrations) -> None:
+    assert "between problems besides the start; and what phases change, as the first has it" in data_card(
+        gather(made)
+    )
 
 
 @pytest.fixture(scope="module")
