@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
 from rich.console import Console, ConsoleRenderable
 
 from dq_space_arm_env import Scene
@@ -28,6 +30,9 @@ from experts import BoxDDP, GuidedDDP, Solution, StopReason
 from experts.problems.arm_problem import ArmProblem
 from experts.report import Maneuver, SolveProgress
 from experts.report.reproduction import results_folder
+
+SPARED = 0.1
+"""An actuator that never takes so large a share of its limit is hardly used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +187,8 @@ def table(run: SolveRun) -> ConsoleRenderable:
     led = ""
     if solution.constraints is not None and not run.scene.constraints:
         led = "the tolerances are constraints: the cheapest maneuver would miss the target"
+    elif not run.ends_within and any(each["constrained"] for each in solution.metadata.get("attempts", ())):
+        led = "of the cheapest maneuver; none that reaches the target was found"
     rows = [
         ("start", run.start.title, ""),
         ("preparation", f"{run.preparation_seconds:.1f} s", prepared),
@@ -193,4 +200,16 @@ def table(run: SolveRun) -> ConsoleRenderable:
     (name, error, tolerance), *others = error_rows(run.scene.success, run.final_errors)
     rows += [row for catch in run.catches for row in catch_rows(catch)]
     rows += [(name, error, f"{tolerance}; {reached}"), *others]
+    if not run.ends_within and math.isfinite(solution.cost):
+        rows += _spared(Maneuver(run.start.episode_scene, solution.states, solution.controls))
     return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)
+
+
+def _spared(maneuver: Maneuver) -> Iterator[tuple[str, str, str]]:
+    """Actuators that a maneuver hardly uses, though it misses the target: their weights make them dear."""
+    for actuator in maneuver.actuators:
+        limited = actuator.limits > 0.0
+        share = float(np.max(actuator.largest[limited] / actuator.limits[limited], initial=0.0))
+        if share < SPARED:
+            used = f"at most {100.0 * share:.1g} % of its limit"
+            yield "hardly used", actuator.name, f"{used}: a smaller cost.{actuator.name} leads farther"

@@ -23,6 +23,7 @@ from dq_space_arm_env.command_line.simulated_episode import (
 from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, UNUSABLE
 from dq_space_arm_env.task.trajectory import Trajectory
 from experts import Solution
+from experts.problems.arm_problem import ArmProblem
 from experts.report import SolveProgress
 
 
@@ -99,6 +100,23 @@ def test_what_has_not_converged_is_saved_and_said(
     table = capsys.readouterr().out
     assert "NOT converged (max_iterations)" in table, table
     assert Solution.load(tmp_path / "solution.npz").iterations == 1
+
+
+def test_a_maneuver_that_misses_names_the_inputs_that_it_hardly_uses(
+    scene_file: str, scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = ArmProblem(scene).initial_state + 0.0
+    far[2:4] += 1.0  # m, away from the target, without thrusters
+    start = ",".join(map(repr, far.tolist()))
+    arguments = ["solve", scene_file, "--solver", "box", "--start", start, "--out", str(tmp_path)]
+    for more, hint in (
+        (["--max-iterations", "0"], "hardly used base_torque at most 0 % of its limit:"),
+        ([], ""),
+    ):
+        main([*arguments, *more])
+        table = " ".join(capsys.readouterr().out.split())
+        assert "NOT within the tolerance" in table
+        assert hint in table if hint else "hardly used" not in table
 
 
 def test_an_interrupt_saves_the_best_so_far(
