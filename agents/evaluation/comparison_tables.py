@@ -223,7 +223,13 @@ def remarks(evaluations: Iterable[Evaluation]) -> Iterator[str]:
 
 def notes(comparison: Comparison) -> list[str]:
     """Sentences that explain the tables of a comparison."""
-    return [*comparison.notes, *remarks(row.evaluation for row in comparison.rows)]
+    entrants = [members for each in comparison.conditions for _, members in comparison.entrants(each)]
+    found = [*comparison.notes, *remarks(row.evaluation for row in comparison.rows)]
+    if any(len(members) == 1 and _is_agent(members) for members in entrants):
+        found.append(
+            "Intervals of an agent with one training run tell of other starts, not of other trainings."
+        )
+    return found
 
 
 def markdown(title: str, tables: Sequence[TextTable], comparison: Comparison) -> str:

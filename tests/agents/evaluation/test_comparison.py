@@ -254,6 +254,7 @@ def test_finished_rows_are_taken_up(tmp_path, monkeypatch, quick):
     monkeypatch.setattr("agents.evaluation.comparing.fly_plans", refuse)
     again = compare([run], quick, 3, **arguments | {"out": str(tmp_path / "out")})
     assert json.dumps(record(again)) == json.dumps(record(first))
+    assert any("not of other trainings" in sentence for sentence in notes(again))
     (tmp_path / "out" / "rows" / files[1]).write_text("{")
     with pytest.raises(AssertionError, match="evaluated again"):
         compare([run], quick, 3, **arguments)
@@ -272,6 +273,7 @@ def test_tables_have_all_columns_of_the_protocol(comparison):
     for sentence in notes(comparison):
         assert sentence in text
     assert any("they do not know the new one" in sentence for sentence in notes(comparison))
+    assert not any("other trainings" in sentence for sentence in notes(comparison))  # the stub has three
     entrants = [*CONTROLLERS.values(), "stub, seeds 0, 1, 2"]
     assert [row[0] for row in profiles.rows] == entrants
     assert [row[1] for row in improvements.rows] == entrants[:-1]
