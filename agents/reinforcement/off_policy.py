@@ -64,7 +64,8 @@ LAYER_NORMALIZED: Mapping[str, type[BasePolicy]] = {
 def _remaining(model: OffPolicyAlgorithm) -> float:
     """Share of the schedule that is left."""
     # Negative where the copies gather more decisions before the last update than the schedule has left.
-    return max(model._current_progress_remaining, 0.0)
+    remaining: float = max(model._current_progress_remaining, 0.0)
+    return remaining
 
 
 class FallingEntropy(OffPolicyAlgorithm):

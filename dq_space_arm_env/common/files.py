@@ -129,14 +129,15 @@ def _flush_names(folder: Path) -> None:
 
 def check_writable_file(path: Path, *read: str | Path | None) -> None:
     """Raise ValueError if a file cannot be created or replaced, or is one that is read; create nothing."""
-    if path.resolve() in [Path(each).resolve() for each in read if each is not None]:
-        raise ValueError(f"{path} is what is read, which it would replace: name another file")
     target, mode = _target(path)
     if path.is_symlink() and not target.parent.is_dir():
         raise ValueError(f"{path} links to {target}, whose folder does not exist")
     check_writable(target.parent)
     if mode is not None and not os.access(target, os.W_OK):
         raise ValueError(f"{path}: no permission to write this file")
+    # A name of a scene or policy is no file.
+    if mode is not None and target.resolve() in [Path(each).resolve() for each in read if each is not None]:
+        raise ValueError(f"{path} is what is read, which it would replace: name another file")
 
 
 def check_writable(folder: Path) -> None:

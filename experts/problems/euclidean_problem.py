@@ -66,6 +66,7 @@ def runge_kutta(dynamics: Function, time_step: float) -> Function:
 
 
 def _count(value: Any) -> int:
+    """How many numbers an array or a CasADi expression holds."""
     return int(value.numel() if hasattr(value, "numel") else np.size(value))
 
 

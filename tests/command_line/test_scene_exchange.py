@@ -318,6 +318,7 @@ def test_the_robot_that_is_read_is_not_replaced_even_by_force(
         assert main(["scenes", *words, "--force"]) == UNUSABLE
         assert f"{name} is what is read, which it would replace" in capsys.readouterr().err
         assert Path(name).read_text(encoding="utf-8") == "mine"
+    assert main(["scenes", "export", "no-wrist", "--out", "no-wrist"]) == SUCCESS  # a name is no file
 
 
 @pytest.mark.parametrize(
