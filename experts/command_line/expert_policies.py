@@ -66,6 +66,8 @@ def _plan(start: Start, console: Console) -> Solution:
 
     with SolveProgress(console, start.scene) as progress:
         solver = GuidedDDP(start.scene)
+        solver.prepare(progress.update)
+        progress.start()
         found = solver.solve(start.state, callback=progress.update, parameters=start.parameters)
         return uninterrupted(found)
 

@@ -95,7 +95,7 @@ def solve(
         solver: BoxDDP | GuidedDDP = GuidedDDP(scene, **limits) if guided else BoxDDP(scene, **limits)
         before = None
         if isinstance(solver, GuidedDDP):
-            # Solve the library now, to time this solve alone.
+            solver.prepare(progress.update)  # now, to time this solve alone
             before = sum(known.iterations for known in solver.library)
         prepared = perf_counter()
         progress.start()

@@ -86,7 +86,7 @@ def expert_of(scene: Scene) -> Expert:
     """Return the expert of this process, ready to solve: kernels compiled, the nominal maneuver solved."""
     problem = ArmProblem(scene)
     solver = GuidedDDP(problem, reserve=RESERVE)
-    _ = solver.library
+    solver.prepare()
     return Expert(problem, solver)
 
 

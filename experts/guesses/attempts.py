@@ -117,24 +117,25 @@ class GuessSolver:
         solution.metadata["attempts"] = [attempt.summary() for attempt in attempts]
         return solution
 
-    def solve_initial_state(self) -> list[Solution]:
+    def solve_initial_state(self, callback: Callback | None = None) -> list[Solution]:
         """Solve the problem's own initial state from zero controls; no solution if every rollout diverges."""
         start = np.asarray(self.problem.initial_state, dtype=np.float64)
         self.problem.parameters.set(None)
         solutions: list[Solution] = []
         for regularization in START_REGULARIZATIONS:
-            solutions.append(uninterrupted(self.solve(zero_controls(regularization), start)))
+            guess = zero_controls(regularization)
+            solutions.append(uninterrupted(self.solve(guess, start, callback)))
         best = min(solutions, key=lambda solution: solution.cost)
         return [best] if np.isfinite(best.cost) else []
 
-    def is_near_minimum(self, guess: Guess, start: FloatArray) -> bool:
+    def is_near_minimum(self, guess: Guess, start: FloatArray, callback: Callback | None = None) -> bool:
         """Whether a minimum is few iterations away from a guess."""
         solver = self._solver_for(guess)
         most = solver.max_iterations
         constrained = guess.multipliers is not None
         solver.max_iterations = NEAR_ITERATIONS_CONSTRAINED if constrained else NEAR_ITERATIONS
         try:
-            return uninterrupted(self.solve(guess, start)).converged
+            return uninterrupted(self.solve(guess, start, callback)).converged
         finally:
             solver.max_iterations = most
 

@@ -130,6 +130,7 @@ class GuidedDDP:
         self._library = None if library is None else list(library)
         for i, solution in enumerate(self._library or ()):
             _check_sizes(f"library[{i}]", solution, self.problem)
+        self._callback: Callback | None = None  # of the preparation
         self._coarse: GuidedDDP | None = None
         self._coarsening: tuple[int, ...] | None = None if isinstance(self.problem, ArmProblem) else ()
         if coarsening is not None:
@@ -143,6 +144,23 @@ class GuidedDDP:
             "another one of the same scene or problem, with the same library"
         )
 
+    def prepare(self, callback: Callback | None = None) -> None:
+        """Find the long steps and solve the library now, not on first use.
+
+        Args:
+            callback: Called with the record of every iteration, whose costs are sums over the stages of the
+                steps that it is solved in; it may raise KeyboardInterrupt to end the preparation. Nothing is
+                iterated where another process has prepared the same.
+
+        Raises:
+            KeyboardInterrupt: If the user interrupts it.
+        """
+        self._report_to(callback)
+        try:
+            _ = self.library
+        finally:
+            self._report_to(None)
+
     @property
     def library(self) -> tuple[Solution, ...]:
         """The maneuvers whose policies are guesses; the first access may solve them, in long steps if any.
@@ -154,7 +172,7 @@ class GuidedDDP:
         if self._coarse is not None:
             return tuple(refined(solution, self.problem) for solution in self._coarse.library)
         if self._library is None:
-            self._library = self._solver.solve_initial_state()
+            self._library = self._solver.solve_initial_state(self._callback)
         return tuple(self._library)
 
     @property
@@ -334,7 +352,14 @@ class GuidedDDP:
         )
         if after is not None:
             found._coarse = after
+        found._report_to(self._callback)
         return found
+
+    def _report_to(self, callback: Callback | None) -> None:
+        """Report the iterations of the preparation to a callback from now on."""
+        self._callback = callback
+        if self._coarse is not None:
+            self._coarse._report_to(callback)
 
     def _prepare(self) -> None:
         """Find how to solve this maneuver, or read what another process found."""
@@ -361,6 +386,7 @@ class GuidedDDP:
         if not self.chooses_model or not self._solver.reach_target or self._reaches():
             return
         other = type(self)(self.problem, **self._own_settings | {"second_order": SecondOrder.MIRRORED.value})
+        other._report_to(self._callback)
         if other._reaches():
             self.take_model(other.second_order)
             self._coarsening, self._coarse, self._library = other._coarsening, other._coarse, other._library
@@ -369,7 +395,9 @@ class GuidedDDP:
         """Whether the maneuver from the problem's own start reaches the target."""
         longest, is_good = self._longest, self._solver.is_good
         try:
-            return any(map(longest._solver.is_good, longest.library)) or is_good(uninterrupted(self.solve()))
+            if any(map(longest._solver.is_good, longest.library)):
+                return True
+            return is_good(uninterrupted(self.solve(callback=self._callback)))
         except KeyboardInterrupt:
             self._coarsening = None  # the next access begins anew
             raise
@@ -405,8 +433,8 @@ class GuidedDDP:
         """
         start = self.problem.initial_state
         self.problem.parameters.set(None)
-        guess = self._coarse_guess(coarse, start, None)
-        return guess is not None and self._solver.is_near_minimum(guess, start)
+        guess = self._coarse_guess(coarse, start, self._callback)
+        return guess is not None and self._solver.is_near_minimum(guess, start, self._callback)
 
 
 def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> None:

@@ -26,7 +26,7 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
     starts = effort.starts if any(scene.spread.model_dump().values()) else 1
     announce("the scene's own start", 0, starts + 1)
     expert = GuidedDDP(scene, max_iterations=effort.max_iterations)
-    _ = expert.library  # solved now, so that it does not count as time of the first start
+    expert.prepare()  # now, so that it does not count as time of the first start
     env = DQSpaceArmEnv(scene)
     rows: list[Row] = []
     for seed in range(starts):

@@ -119,6 +119,19 @@ def test_a_maneuver_that_misses_names_the_inputs_that_it_hardly_uses(
         assert hint in table if hint else "hardly used" not in table
 
 
+def test_a_solve_shows_what_it_prepares_and_what_it_solves(
+    scene_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("dq_space_arm_env.common.progress.SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr("experts.guesses.guided.read_preparation", lambda key: None)
+    assert main(["solve", scene_file, "--out", str(tmp_path)]) == SUCCESS
+    shown = capsys.readouterr().err
+    before, _, after = shown.rpartition("preparing   ")
+    assert "preparing   solve  1   iteration   1 " in before
+    assert "J " not in before  # of steps of other lengths
+    assert "attempt  1   iteration   1   J " in after
+
+
 def test_an_interrupt_saves_the_best_so_far(
     scene_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

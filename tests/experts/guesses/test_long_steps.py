@@ -127,6 +127,32 @@ def test_long_steps_whose_policy_strays_are_not_halved(monkeypatch):
     assert len(solver.solve().metadata["long_steps"]) == 2  # in steps of one length
 
 
+@pytest.mark.parametrize("settings", [{}, {"coarsening": [8, 4]}, {"coarsening": 1}])
+def test_the_preparation_reports_its_iterations_and_can_be_interrupted(monkeypatch, settings):
+    nothing_kept(monkeypatch)
+    solver, silent = GuidedDDP("planar", **settings), GuidedDDP("planar", **settings)
+    records = []
+
+    def stop_at_the_fifth(record):
+        records.append(record)
+        if len(records) == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        solver.prepare(stop_at_the_fifth)
+    assert len(records) == 5
+    records.clear()
+    solver.prepare(records.append)
+    known = len(records)
+    assert known >= sum(solution.iterations for solution in solver.library) > 0
+    silent.prepare()
+    assert solver.coarsening == silent.coarsening
+    np.testing.assert_array_equal(solver.library[0].controls, silent.library[0].controls)
+    solver.prepare(records.append)
+    solver.solve()
+    assert len(records) == known  # nothing left to prepare, and solves are not part of it
+
+
 @pytest.mark.endurance
 def test_solves_of_six_joints_converge():
     solver = GuidedDDP("six-joint")
