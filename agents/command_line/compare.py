@@ -97,6 +97,8 @@ def agents(
     Three or more runs that differ only in their seeds are also aggregated. Learning curves need the expert's
     optima of their own starts, which are solved once.
     """
+    if receding_starts is not None and controllers and "receding" not in controllers:
+        raise ValueError(f"--receding-starts: {receding_starts}, but --controller leaves out receding")
     executor = chosen_executor(workers, ray)
     from agents.evaluation.evaluation_verbs import compare_controllers
 

@@ -170,9 +170,15 @@ def check_fit(policy: ActingPolicy, scene: Scene) -> None:
     if policy.sizes != (seen, layout.n_u):
         origin = policy.metadata.get("scene")
         made = f" (it was trained for scene {origin!r})" if origin else ""
+        stacked, rest = divmod(policy.sizes[0], seen)
+        remedy = "evaluate it on its own scene"
+        if stacked > 1 and not rest and policy.sizes[1] == layout.n_u:
+            remedy += (
+                f"; if it sees the last {stacked} observations, as of VecFrameStack, fly it by a function"
+            )
         raise PolicyError(
             f"{policy.label} maps {policy.sizes[0]} observations to {policy.sizes[1]} inputs{made}; scene "
-            f"{scene.name!r} has {seen} and {layout.n_u}: evaluate it on its own scene"
+            f"{scene.name!r} has {seen} and {layout.n_u}: {remedy}"
         )
 
 

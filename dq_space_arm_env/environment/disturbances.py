@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.parameters import Number, body_numbers, is_part
@@ -42,6 +43,10 @@ class Disturbances:
         inputs: Standard deviation of the noise on the inputs, shape (), (B,) or (B, n_u), fractions of the
             limits; None for no noise.
         count: B, if no standard deviation tells it.
+
+    Raises:
+        TypeError: If a standard deviation is masked, or not of real numbers.
+        ValueError: If one is negative, not finite or of another shape, or `pushes` is negative or not finite.
     """
 
     def __init__(
@@ -59,10 +64,16 @@ class Disturbances:
         layout, steps = StateLayout.of(scene), scene.simulation.steps
         self._rng, self._step = rng, 0
         self._n_t, self._n_u, self._velocity = layout.n_t, layout.n_u, layout.tangent.base_velocity
-        sizes = [len(np.atleast_1d(sigma)) for sigma in (push, measurement, inputs) if sigma is not None]
-        self.count = max([count, *sizes])
+        if not 0.0 <= pushes < np.inf:
+            raise ValueError(f"pushes: {pushes}, should be a finite number of at least 0")
+        given = {"push": push, "measurement": measurement, "inputs": inputs}
+        columns = {name: _column(name, sigma) for name, sigma in given.items() if sigma is not None}
+        self.count = max([count, *map(len, columns.values())])
+        pushed = len(range(self._n_t)[self._velocity])
+        widths = {"push": pushed, "measurement": self._n_t, "inputs": self._n_u}
         self._push, self._measurement, self._inputs = (
-            None if sigma is None else self._column(sigma) for sigma in (push, measurement, inputs)
+            self._for_episodes(name, columns[name], width) if name in columns else None
+            for name, width in widths.items()
         )
         self._probability = pushes / steps
         self._interval = max(steps // int(pushes + 1), 1) if evenly else 0
@@ -73,10 +84,13 @@ class Disturbances:
         """Number of episodes that `draw` disturbs."""
         return self.count
 
-    def _column(self, sigma: ArrayLike) -> FloatArray:
-        """A standard deviation for each episode, shape (B, 1), or for each of its numbers, (B, n)."""
-        given = np.asarray(sigma, dtype=np.float64)
-        column = given if given.ndim == 2 else np.atleast_1d(given)[:, None]
+    def _for_episodes(self, name: str, column: FloatArray, width: int) -> FloatArray:
+        """Standard deviations for each episode, shape (B, 1), or for each of its numbers, (B, width)."""
+        if column.shape[0] not in (1, self.count) or column.shape[1] not in (1, width):
+            raise ValueError(
+                f"{name}: shape {column.shape}, should be one row for all of the {self.count} episodes or "
+                f"one for each, and in each row one number or {width}"
+            )
         return np.broadcast_to(column, (self.count, column.shape[1]))
 
     def draw(self) -> Disturbance:
@@ -102,6 +116,17 @@ class Disturbances:
         strength = self._rng.standard_normal(push[:, self._velocity].shape)
         push[:, self._velocity] = np.where(struck, self._push * strength, 0.0)
         return push
+
+
+def _column(name: str, sigma: ArrayLike) -> FloatArray:
+    """Standard deviations as rows, one for each episode."""
+    found = real_array(name, sigma, np.float64)
+    wrong = found[~(np.isfinite(found) & (found >= 0.0))]
+    if wrong.size:
+        raise ValueError(f"{name}: {wrong[0]}, should be finite and at least 0")
+    if found.ndim > 2:
+        raise ValueError(f"{name}: shape {found.shape}, should have at most two axes")
+    return found if found.ndim == 2 else np.atleast_1d(found)[:, None]
 
 
 def displaced(kernels: Kernels, x: NDArray[Any], increments: FloatArray) -> NDArray[Any]:

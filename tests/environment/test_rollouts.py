@@ -194,6 +194,22 @@ def test_disturbances_are_those_of_all_episodes(scene):
     assert not np.array_equal(flown.noise[0], flown.noise[1])
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"push": -0.1}, "push: -0.1, should be finite and at least 0"),
+        ({"measurement": [0.0, np.nan]}, "measurement: nan, should be finite and at least 0"),
+        ({"inputs": [0.1, 0.2], "count": 3}, r"inputs: shape \(2, 1\), should be one row for all of the 3"),
+        ({"inputs": np.ones((2, 4)), "count": 2}, r"inputs: shape \(2, 4\), .*in each row one number or"),
+        ({"push": np.zeros((1, 1, 1))}, "should have at most two axes"),
+        ({"push": 0.1, "pushes": -1}, "pushes: -1, should be a finite number of at least 0"),
+    ],
+)
+def test_disturbances_refuse_what_is_no_standard_deviation(scene, settings, message):
+    with pytest.raises(ValueError, match=message):
+        Disturbances(scene, np.random.default_rng(0), **settings)
+
+
 @pytest.mark.parametrize("steps", [0, -1, 2.5, True])
 def test_a_rollout_takes_a_step_at_least(scene, steps):
     with pytest.raises(ValueError, match=f"steps: {steps}, should be a whole number of at least 1"):

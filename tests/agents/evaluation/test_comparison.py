@@ -372,6 +372,12 @@ def test_the_verb_refuses_a_policy_before_it_begins(tmp_path, capsys, quick):
     assert not (tmp_path / "out" / "rows").exists()
 
 
+def test_starts_of_a_controller_that_does_not_fly_are_refused(tmp_path, capsys):
+    arguments = ["--controller", "gains", "--receding-starts", "3", "--out", str(tmp_path / "out")]
+    assert main(["compare", "agents", *arguments]) == 2
+    assert "--receding-starts: 3, but --controller leaves out receding" in capsys.readouterr().err
+
+
 def test_the_figure_draws_gaps_that_no_logarithm_has(comparison):
     pytest.importorskip("matplotlib")
     from agents.evaluation.comparison_figure import FLOOR, comparison_figure

@@ -421,6 +421,11 @@ def test_a_policy_of_the_goal_environment_fits_a_scene_with_phases_and_a_moving_
         check_fit(acting, SHORT)
 
 
+def test_a_policy_of_several_observations_at_once_is_told_what_flies_it():
+    with pytest.raises(PolicyError, match="if it sees the last 3 observations, as of VecFrameStack"):
+        check_fit(as_policy(exported(3 * 24, 12, observation="plain")), load_scene("paper"))
+
+
 def test_the_time_of_an_action_is_that_of_actions_before_the_end():
     """A constraint ends the episode after a few of the timed steps."""
     scene = load_scene("planar")
