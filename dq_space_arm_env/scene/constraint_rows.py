@@ -1,7 +1,8 @@
 """Names of the rows c(x, u, p) <= 0 or = 0 of a scene's constraints; environments read them without CasADi.
 
-The residuals are in `task.constraint_residuals`, in the same order. Path rows hold at every stage, those
-without the input at the end too. Terminal rows hold at the end: those, success, and what is exact.
+The residuals are in `task.constraint_residuals` and `task.terminal_residuals`, in the same order. Path rows
+hold at every stage, those without the input at the end too. Terminal rows hold at the end: those, success,
+and what is exact.
 """
 
 import math
@@ -212,7 +213,7 @@ def terminal_rows(scene: Scene) -> tuple[Row, ...]:
         scene: The scene.
 
     Returns:
-        One row per residual of `task.constraint_residuals.terminal_residuals`.
+        One row per residual of `task.terminal_residuals.terminal_residuals`.
     """
     return (*(row for row in path_rows(scene) if not row.has_input), *_final_rows(scene))
 

@@ -22,8 +22,9 @@ import casadi
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.scene.constraint_rows import Row, n_multipliers, penalized_rows, terminal_rows
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.constraint_residuals import penalized_residuals, terminal_residuals
+from dq_space_arm_env.task.constraint_residuals import penalized_residuals
 from dq_space_arm_env.task.equations import SceneEquations, total
+from dq_space_arm_env.task.terminal_residuals import terminal_residuals
 
 Scalar = Any
 Scalars = Sequence[Scalar]

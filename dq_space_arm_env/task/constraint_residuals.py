@@ -1,6 +1,5 @@
-"""Residuals of a scene's constraints over plain scalars, in the order of `scene.constraint_rows`.
+"""Residuals of a scene's constraints along the path, in the order of `scene.constraint_rows`.
 
-All geometry is seen from the base: rows between the robot's own bodies then have no derivative by its pose.
 A residual holds where it is at most zero; it is smooth but for distances between segments, whose closest
 points may jump where the segments are parallel. In cones |v| is sqrt(v . v + e^2) - e, with
 e = `SMALLEST_LENGTH`.
@@ -14,8 +13,6 @@ from typing import Any, NamedTuple
 
 import casadi
 
-from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.algebra.scalars import select, sqrt
 from dq_space_arm_env.algebra.vectors import (
     add,
@@ -25,16 +22,13 @@ from dq_space_arm_env.algebra.vectors import (
     scale,
     subtract,
 )
-from dq_space_arm_env.dynamics import kinematics, minimal, reaction_wheels
-from dq_space_arm_env.dynamics.elastic_gears import drive_energy
+from dq_space_arm_env.dynamics import reaction_wheels
 from dq_space_arm_env.scene.constraint_rows import (
     directions,
-    exact_rows,
     pairs_that_may_touch,
     path_rows,
     rate_limits,
     sides,
-    success_tolerances,
 )
 from dq_space_arm_env.scene.constraints import (
     ApproachCorridor,
@@ -47,16 +41,14 @@ from dq_space_arm_env.scene.constraints import (
     LineOfSight,
     Momentum,
     Plume,
-    Point,
     Propellant,
-    Terminal,
     TorqueSpeed,
     Volume,
     WheelLimits,
     WheelMomentum,
 )
-from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.equations import SceneEquations, body_pose, torque_ranges
+from dq_space_arm_env.task.equations import SceneEquations, torque_ranges
+from dq_space_arm_env.task.situation import Situation
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -65,63 +57,6 @@ SMALLEST_LENGTH = 1e-3
 """Length, m, by which a cone is wider at its apex, where its residual is rounded off."""
 MEETING = 1e-4
 """Distance, m, that stands for none between centers or axes of volumes."""
-
-
-class _Situation:
-    """A state with its input, seen from the base."""
-
-    def __init__(self, equations: SceneEquations, base: Scalars, y: Scalars, u: Scalars) -> None:
-        self.equations, self.base, self.scene = equations, base, equations.scene
-        self.motion = equations.field.motion(y)
-        self.u, self.inputs = u, equations.field.inputs(u)
-        tree, motion = equations.tree, self.motion
-        frames = kinematics.frame_poses(tree, dq.IDENTITY, motion.joint_angles, motion.wrist_angles)
-        bodies = ["base", *(link.name for link in self.scene.links)]
-        names = [*bodies, *(tip.name for tip in self.scene.other_tips)]
-        self._poses: dict[str, Scalars] = dict(zip(names, frames, strict=False))
-        self._poses["tip"] = frames[-1]
-        self._placements: dict[str, tuple[Any, Any]] = {}
-
-    def pose(self, frame: str) -> Scalars:
-        """Pose of a frame seen from the base."""
-        if frame not in self._poses:
-            outside: Scalars = dq.IDENTITY
-            if frame != "inertial":
-                grasp = self.equations.target
-                outside = grasp if frame == "grasp" else body_pose(self.scene, self.equations.given)
-            self._poses[frame] = dq.multiply(dq.conjugate(self.base), outside)
-        return self._poses[frame]
-
-    def placement(self, frame: str) -> tuple[Any, Any]:
-        """Rotation matrix and position of a frame seen from the base."""
-        if frame not in self._placements:
-            self._placements[frame] = poses.to_matrix(self.pose(frame))
-        return self._placements[frame]
-
-    def point(self, frame: str, position: Scalars) -> Scalars:
-        """A point of a frame, base axes, m."""
-        rotation, origin = self.placement(frame)
-        return add(origin, matrix_vector(rotation, position))
-
-    def place_of(self, point: Point) -> Scalars:
-        """A point of a constraint, base axes, m."""
-        return self.point(point.frame, point.position)
-
-    def direction(self, frame: str, vector: Scalars) -> Scalars:
-        """Unit vector along a direction of a frame, base axes."""
-        return matrix_vector(self.placement(frame)[0], scale(1.0 / math.hypot(*vector), vector))
-
-    def momentum(self) -> tuple[Scalars, Scalars, Scalar]:
-        """Linear momentum, angular momentum about the center of mass, base axes; energy."""
-        motion = self.motion
-        tree = self.equations.field.loaded(motion)
-        frames = minimal.link_frames(tree, motion.joint_angles)
-        twist = (*motion.angular, *motion.linear)
-        velocities = kinematics.body_velocities(tree, frames, twist, motion.joint_rates)
-        linear, angular, _ = kinematics.momentum(tree, frames, velocities, motion.wheel_momenta)
-        kinetic, potential = kinematics.energy(tree, motion.joint_angles, velocities, motion.wheel_momenta)
-        motors = (motion.motor_angles, motion.motor_rates)
-        return linear, angular, kinetic + potential + drive_energy(tree, motion.joint_angles, *motors)
 
 
 def path_residuals(equations: SceneEquations, base: Scalars, y: Scalars, u: Scalars) -> list[Scalar]:
@@ -136,7 +71,7 @@ def path_residuals(equations: SceneEquations, base: Scalars, y: Scalars, u: Scal
     Returns:
         One scalar per row of `path_rows`.
     """
-    situation = _Situation(equations, base, y, u)
+    situation = Situation(equations, base, y, u)
     return [
         residual
         for constraint in equations.scene.constraints
@@ -183,57 +118,13 @@ def observed_besides(equations: SceneEquations, base: Scalars, y: Scalars) -> li
     return found + [casadi.tanh(-c / row.observed) for c, row in residuals if row.observed is not None]
 
 
-def reported(
-    before: SceneEquations, after: SceneEquations, x: Scalars, u: Scalars, x_next: Scalars
-) -> list[Scalar]:
-    """Residuals that a step from x to x_next reports: of its end, of x and u where the input counts.
-
-    Args:
-        before: The equations before the step.
-        after: Those after it.
-        x: State before the step, n_x scalars.
-        u: Input, n_u scalars.
-        x_next: State after the step, n_x scalars.
-
-    Returns:
-        One scalar per name of `step_report.constraint_names`.
-    """
-    scene, there = after.scene, (after.base_pose(x_next), after.y(x_next))
-    first = path_residuals(before, before.base_pose(x), before.y(x), u)
-    second = iter(terminal_residuals(after, *there))
-    along = [c if row.has_input else next(second) for row, c in zip(path_rows(scene), first, strict=True)]
-    exact = exact_rows(scene)
-    return along + (list(second)[-len(exact) :] if exact else [])
-
-
-def charged(scene: Scene, residuals: Scalars, at_end: Scalar) -> tuple[Scalar, Scalar]:
-    """Sum of violations, each over its tolerance, and whether one of them ends the episode.
-
-    Args:
-        scene: The scene.
-        residuals: Those of `reported`.
-        at_end: Whether the episode ends: what is exact at the end is charged then.
-
-    Returns:
-        The sum, dimensionless, and a truth value.
-    """
-    cost, ends = 0.0, False
-    rows = (*path_rows(scene), *exact_rows(scene))
-    for row, c in zip(rows, residuals, strict=True):
-        violation = casadi.if_else(at_end, casadi.fabs(c), 0.0) if row.is_equality else casadi.fmax(c, 0.0)
-        cost = cost + violation / row.tolerance
-        if row.terminates:
-            ends = casadi.logic_or(ends, c > row.tolerance)
-    return cost, ends
-
-
-def _joint_limits(situation: _Situation, limits: JointLimits) -> Iterator[Scalar]:
+def _joint_limits(situation: Situation, limits: JointLimits) -> Iterator[Scalar]:
     for side in sides(situation.scene, limits):
         values = situation.motion.joint_rates if side.is_rate else situation.motion.joint_angles
         yield side.sign * values[side.joint] - side.bound
 
 
-def _distance(situation: _Situation, constraint: Distance) -> Iterator[Scalar]:
+def _distance(situation: Situation, constraint: Distance) -> Iterator[Scalar]:
     for _, body, _, obstacle in pairs_that_may_touch(situation.scene, constraint):
         apart = _segment_distance(_segment(situation, body), _segment(situation, obstacle))
         yield body.radius + obstacle.radius - apart
@@ -244,7 +135,7 @@ class _Segment(NamedTuple):
     along: Scalars | None  # from start to end; None for a point
 
 
-def _segment(situation: _Situation, volume: Volume) -> _Segment:
+def _segment(situation: Situation, volume: Volume) -> _Segment:
     start, end = volume.ends
     place = situation.point(volume.frame, start)
     if start == end:
@@ -292,7 +183,7 @@ def _length(vector: Scalars) -> Scalar:
     return sqrt(dot(vector, vector) + SMALLEST_LENGTH**2) - SMALLEST_LENGTH
 
 
-def _cosine(situation: _Situation, constraint: KeepInDirection | KeepOutDirection) -> Scalar:
+def _cosine(situation: Situation, constraint: KeepInDirection | KeepOutDirection) -> Scalar:
     axis, direction = constraint.axis, constraint.direction
     return dot(
         situation.direction(axis.frame, axis.direction),
@@ -300,15 +191,15 @@ def _cosine(situation: _Situation, constraint: KeepInDirection | KeepOutDirectio
     ) - math.cos(math.radians(constraint.angle_deg))
 
 
-def _keep_out_direction(situation: _Situation, constraint: KeepOutDirection) -> Iterator[Scalar]:
+def _keep_out_direction(situation: Situation, constraint: KeepOutDirection) -> Iterator[Scalar]:
     yield _cosine(situation, constraint)
 
 
-def _keep_in_direction(situation: _Situation, constraint: KeepInDirection) -> Iterator[Scalar]:
+def _keep_in_direction(situation: Situation, constraint: KeepInDirection) -> Iterator[Scalar]:
     yield -_cosine(situation, constraint)
 
 
-def _line_of_sight(situation: _Situation, constraint: LineOfSight) -> Iterator[Scalar]:
+def _line_of_sight(situation: Situation, constraint: LineOfSight) -> Iterator[Scalar]:
     """cos(angle) |d| - boresight . d, with d from camera to point (Lee & Mesbahi, JGCD 2017)."""
     camera = constraint.camera
     d = subtract(situation.place_of(constraint.point), situation.place_of(camera))
@@ -316,7 +207,7 @@ def _line_of_sight(situation: _Situation, constraint: LineOfSight) -> Iterator[S
     yield math.cos(math.radians(constraint.angle_deg)) * _length(d) - dot(boresight, d)
 
 
-def _approach_corridor(situation: _Situation, constraint: ApproachCorridor) -> Iterator[Scalar]:
+def _approach_corridor(situation: Situation, constraint: ApproachCorridor) -> Iterator[Scalar]:
     """Distance from the axis less the corridor's radius there."""
     apex = constraint.apex
     r = subtract(situation.place_of(constraint.point), situation.place_of(apex))
@@ -326,7 +217,7 @@ def _approach_corridor(situation: _Situation, constraint: ApproachCorridor) -> I
     yield _length(aside) - constraint.width - height * math.tan(math.radians(constraint.angle_deg))
 
 
-def _plume(situation: _Situation, constraint: Plume) -> Iterator[Scalar]:
+def _plume(situation: Situation, constraint: Plume) -> Iterator[Scalar]:
     """How deep -f is in the cone in which gas meets the sphere; half angle al = plume + asin(R / |d|).
 
     Its distance from the surface is sin(al) (-f . n) - cos(al) |f x n| with n = d / |d| toward the sphere:
@@ -351,7 +242,7 @@ def _plume(situation: _Situation, constraint: Plume) -> Iterator[Scalar]:
         yield size * (-sine * along - cosine * sqrt(dot(aside, aside) + 1e-12))
 
 
-def _cone_of_gas(situation: _Situation, constraint: Plume, place: Scalars) -> tuple[Scalar, Scalar, Scalars]:
+def _cone_of_gas(situation: Situation, constraint: Plume, place: Scalars) -> tuple[Scalar, Scalar, Scalars]:
     """Sine and cosine of the half angle al, and direction n to the sphere, of gas that leaves at a place."""
     sphere = constraint.keeps_clear
     d = subtract(situation.point(sphere.frame, sphere.position), place)
@@ -365,7 +256,7 @@ def _cone_of_gas(situation: _Situation, constraint: Plume, place: Scalars) -> tu
     return sine_of_both, cosine_of_both, scale(1.0 / sqrt(square), d)
 
 
-def _momentum(situation: _Situation, constraint: Momentum) -> Iterator[Scalar]:
+def _momentum(situation: Situation, constraint: Momentum) -> Iterator[Scalar]:
     """(|h|^2 - bound^2) / (2 bound), smooth at zero; likewise of the energy, which is quadratic itself."""
     linear, angular, energy = situation.momentum()
     for vector, bound in ((linear, constraint.linear), (angular, constraint.angular)):
@@ -375,14 +266,14 @@ def _momentum(situation: _Situation, constraint: Momentum) -> Iterator[Scalar]:
         yield energy - constraint.energy
 
 
-def _wheel_momentum(situation: _Situation, constraint: WheelMomentum) -> Iterator[Scalar]:
+def _wheel_momentum(situation: Situation, constraint: WheelMomentum) -> Iterator[Scalar]:
     _, angular, _ = situation.momentum()
     for axis in directions(situation.scene, "angular_momentum"):
         yield -angular[axis] - constraint.capacity
         yield angular[axis] - constraint.capacity
 
 
-def _wheel_limits(situation: _Situation, constraint: WheelLimits) -> Iterator[Scalar]:
+def _wheel_limits(situation: Situation, constraint: WheelLimits) -> Iterator[Scalar]:
     """Speeds within +-Omega_max, torques within +-P / |Omega|.
 
     The latter are seen at the corner P / u_max, the speed where the power takes over from the torque: nearly
@@ -403,12 +294,12 @@ def _wheel_limits(situation: _Situation, constraint: WheelLimits) -> Iterator[Sc
             yield corner * (torque - most)
 
 
-def _propellant(situation: _Situation, constraint: Propellant) -> Iterator[Scalar]:
+def _propellant(situation: Situation, constraint: Propellant) -> Iterator[Scalar]:
     (left,), (rate,) = situation.motion.propellant, situation.inputs.propellant_rates
     yield constraint.reserve - (left + rate * situation.scene.simulation.dt)
 
 
-def _control_rate(situation: _Situation, constraint: ControlRate) -> Iterator[Scalar]:
+def _control_rate(situation: Situation, constraint: ControlRate) -> Iterator[Scalar]:
     scene, layout = situation.scene, situation.equations.layout
     before = dict(zip(layout.previous_controls, situation.motion.previous_controls, strict=True))
     for limit in rate_limits(scene, constraint):
@@ -417,7 +308,7 @@ def _control_rate(situation: _Situation, constraint: ControlRate) -> Iterator[Sc
         yield change - most
 
 
-def _torque_speed(situation: _Situation, constraint: TorqueSpeed) -> Iterator[Scalar]:
+def _torque_speed(situation: Situation, constraint: TorqueSpeed) -> Iterator[Scalar]:
     for torque, least, greatest in torque_ranges(situation.equations, situation.motion, situation.u):
         yield least - torque
         yield torque - greatest
@@ -438,71 +329,3 @@ _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     ControlRate: _control_rate,
     TorqueSpeed: _torque_speed,
 }
-
-
-def terminal_residuals(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
-    """Residuals of the rows at the end.
-
-    Args:
-        equations: The scene's, with the parameters of the end.
-        base: Pose of the base q_{e0/I}, 8 scalars.
-        y: The state without the pose.
-
-    Returns:
-        One scalar per row of `terminal_rows`.
-    """
-    return [*state_residuals(equations, base, y), *_final_residuals(equations, base, y)]
-
-
-def _final_residuals(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
-    """Residuals of success and of what is exact.
-
-    A tolerance t of success is (e^2 / t - t) / 2 of an error e: smooth where e is zero, e - t near t.
-    """
-    scene = equations.scene
-    situation = _Situation(equations, base, y, [0.0] * equations.field.n_u)
-    error = dq.multiply(dq.conjugate(situation.pose("grasp")), situation.pose("tip"))  # q_{G/D}
-    twist = dual_vectors.subtract(equations.tip_twist(situation.motion), _target_twist(equations, error))
-    found = _success_residuals(scene, error, twist)
-    if scene.other_tips:
-        others = equations.other_errors(base, y), equations.other_twists(base, y)
-        for own in zip(*others, strict=True):
-            found += _success_residuals(scene, *own)
-    halves = (scale(2.0, error[1:4]), poses.position(error))
-    for constraint in scene.constraints:
-        for quantity in constraint.exact if isinstance(constraint, Terminal) else ():
-            values = _exact(situation, quantity, [*halves[0], *halves[1]], twist)
-            found += [values[i] for i in directions(scene, quantity)]
-    return found
-
-
-def _success_residuals(scene: Scene, error: Scalars, twist: Scalars) -> list[Scalar]:
-    """Those of a tip, by its error pose and its twist relative to its goal."""
-    # |2 vec q_r| is 2 sin(angle / 2), the angle up to third order.
-    vectors = (scale(2.0, error[1:4]), poses.position(error), twist[:3], twist[3:])
-    names = ("attitude error", "position error", "angular velocity error", "velocity error")
-    squares = {name: dot(vector, vector) for name, vector in zip(names, vectors, strict=True)}
-    found = []
-    for name, _, tolerance in success_tolerances(scene):
-        bound = 2.0 * math.sin(0.5 * tolerance) if name == names[0] else tolerance
-        found.append(0.5 * (squares[name] / bound - bound))
-    return found
-
-
-def _target_twist(equations: SceneEquations, error: Scalars) -> Scalars:
-    """Twist of the target in the tip's axes, by the pose q_{G/D}."""
-    return dual_vectors.inverse_transform(*poses.to_matrix(error), equations.target_velocity)
-
-
-def _exact(situation: _Situation, quantity: str, pose: Scalars, twist: Scalars) -> Scalars:
-    """What is zero where a quantity is exact at the end."""
-    if quantity == "pose":
-        return pose
-    if quantity == "twist":
-        return twist
-    if quantity == "base_velocity":
-        moving = (*situation.motion.angular, *situation.motion.linear)
-        desired = situation.equations.desired_base_velocity(situation.base)
-        return [a - b for a, b in zip(moving, desired, strict=True)]
-    linear, angular, _ = situation.momentum()
-    return linear if quantity == "linear_momentum" else angular

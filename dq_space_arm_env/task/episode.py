@@ -33,7 +33,7 @@ from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import episode_start, parameter_values
 from dq_space_arm_env.task.actuator_limits import applied
 from dq_space_arm_env.task.catching import Catching, has_catch
-from dq_space_arm_env.task.constraint_residuals import charged, observed_besides, reported
+from dq_space_arm_env.task.constraint_residuals import observed_besides
 from dq_space_arm_env.task.equations import (
     SceneEquations,
     body_pose,
@@ -44,6 +44,7 @@ from dq_space_arm_env.task.equations import (
     weighted_square,
 )
 from dq_space_arm_env.task.step_report import MEMORY, STATE_LIMIT, has_twist_errors, report_names
+from dq_space_arm_env.task.terminal_residuals import charged, reported
 from dq_space_arm_env.task.worst_case import worst_cost
 
 Scalar = Any

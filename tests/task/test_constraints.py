@@ -14,8 +14,9 @@ from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows
 from dq_space_arm_env.scene.constraints import Volume
-from dq_space_arm_env.task.constraint_residuals import _Segment, _segment_distance, terminal_residuals
+from dq_space_arm_env.task.constraint_residuals import _Segment, _segment_distance
 from dq_space_arm_env.task.equations import SceneEquations
+from dq_space_arm_env.task.terminal_residuals import terminal_residuals
 
 FRAME = {"frame": "link 2", "to": [0.75, 0.1, -0.2], "radius": 0.05}
 KINDS = {

@@ -12,8 +12,9 @@ from dq_space_arm_env.algebra.symbolic import column, symbols
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.integrators.method import graph_inputs, program_inputs
-from dq_space_arm_env.task.constraint_residuals import path_residuals, terminal_residuals
+from dq_space_arm_env.task.constraint_residuals import path_residuals
 from dq_space_arm_env.task.equations import SceneEquations
+from dq_space_arm_env.task.terminal_residuals import terminal_residuals
 
 Scalar = Any
 Scalars = Sequence[Scalar]

@@ -22,8 +22,9 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
-from dq_space_arm_env.task.constraint_residuals import path_residuals, terminal_residuals
+from dq_space_arm_env.task.constraint_residuals import path_residuals
 from dq_space_arm_env.task.equations import SceneEquations
+from dq_space_arm_env.task.terminal_residuals import terminal_residuals
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
