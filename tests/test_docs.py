@@ -109,7 +109,7 @@ def test_scene_files_in_the_documentation_are_scenes():
         assert scene.simulation.dt == 0.015
 
 
-@pytest.mark.slow
+@pytest.mark.endurance  # two minutes together; CI loads these scenes
 @pytest.mark.parametrize(("page", "file"), scene_files())
 def test_the_expert_flies_scene_files_in_the_documentation_to_their_targets(page, file):
     scene = dq_space_arm_env.load_scene(parse_yaml(file))
