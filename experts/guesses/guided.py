@@ -370,7 +370,11 @@ class GuidedDDP:
         if known is None:
             self._coarsening, self._coarse = find_coarsening(self)
             if key is not None:
-                self._take_model_that_reaches()
+                try:
+                    self._take_model_that_reaches()
+                except KeyboardInterrupt:
+                    self._coarsening = None  # the next access begins anew
+                    raise
                 found = self._coarsening, self._solver.second_order, self._longest.library
                 keep_preparation(key, Preparation(*found))
             return
@@ -393,14 +397,10 @@ class GuidedDDP:
 
     def _reaches(self) -> bool:
         """Whether the maneuver from the problem's own start reaches the target."""
-        longest, is_good = self._longest, self._solver.is_good
-        try:
-            if any(map(longest._solver.is_good, longest.library)):
-                return True
-            return is_good(uninterrupted(self.solve(callback=self._callback)))
-        except KeyboardInterrupt:
-            self._coarsening = None  # the next access begins anew
-            raise
+        longest = self._longest
+        if any(map(longest._solver.is_good, longest.library)):
+            return True
+        return self._solver.is_good(uninterrupted(self.solve(callback=self._callback)))
 
     @property
     def _own_settings(self) -> dict[str, Any]:

@@ -153,6 +153,26 @@ def test_the_preparation_reports_its_iterations_and_can_be_interrupted(monkeypat
     assert len(records) == known  # nothing left to prepare, and solves are not part of it
 
 
+def test_an_interrupt_while_another_model_is_tried_begins_anew(monkeypatch):
+    nothing_kept(monkeypatch)
+    interrupts = [True]
+
+    def reaches(solver):
+        """Only the mirrored model reaches the target; the first look at it is interrupted."""
+        if solver._solver.second_order != "mirrored":
+            return False
+        if interrupts:
+            raise KeyboardInterrupt(interrupts.pop())
+        return bool(solver.library)
+
+    monkeypatch.setattr(GuidedDDP, "_reaches", reaches)
+    solver = GuidedDDP("planar")
+    with pytest.raises(KeyboardInterrupt):
+        solver.prepare()
+    solver.prepare()
+    assert solver.second_order == "mirrored"
+
+
 @pytest.mark.endurance
 def test_solves_of_six_joints_converge():
     solver = GuidedDDP("six-joint")
