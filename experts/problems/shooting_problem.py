@@ -45,7 +45,7 @@ A problem may have these attributes besides those of `ShootingProblem`:
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,6 +94,12 @@ class StageParameters:
         self._in_stages = in_stages
         self.inputs: tuple[FloatArray, ...] = (self._whole,) if self._whole.size else ()
         self.set(None)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a problem's parameters cannot be copied or pickled, kernels read them where they are: make "
+            "another problem of the same scene"
+        )
 
     def checked(self, parameters: ArrayLike | None) -> FloatArray:
         """Return parameters as rows, (N + 1, n_p).

@@ -14,6 +14,7 @@ from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.second_order import LARGEST_MU
 from experts.ddp.solution import StopReason
 from experts.guesses.guided import GuidedDDP
+from experts.problems.arm_problem import ArmProblem
 
 
 def solve_condensed(system, limit, initial_state=None):
@@ -465,3 +466,11 @@ def test_input_without_a_weight_is_refused(pendulum):
 def test_solvers_share_their_work_arrays_with_nobody(pendulum, solver, duplicate):
     with pytest.raises(TypeError, match=r"cannot be copied or pickled, .* make another one of the same"):
         duplicate(solver(pendulum))
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, pickle.dumps])
+def test_problems_share_with_nobody_what_their_kernels_read(duplicate):
+    problem = ArmProblem("paper")
+    assert copy.copy(problem).parameters is problem.parameters
+    with pytest.raises(TypeError, match=r"cannot be copied or pickled, .* make another problem of the same"):
+        duplicate(problem)
