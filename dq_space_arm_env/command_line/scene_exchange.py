@@ -58,6 +58,7 @@ _OPTIONS = {
 _MOST_ENDS = 12  # of arms that are listed
 _TOLERANCE = 0.1  # most of the position at the end, relative to the length of the arm
 _WAY = 0.25  # likewise, relative to the way to the target
+_ROOMY = 0.9  # share of the spread asked for, below which its user is told
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ class Imported:
     efforts: tuple[float | None, ...]
     spacecraft: float = 0.0  # mass that the file does not have, kg
     steps: tuple[StepTrial, ...] = ()  # integrators and time steps that were measured
+    joint_torque: float | None = None  # given limit of joints without an effort, N m
 
 
 @contextmanager
@@ -131,6 +133,12 @@ def import_urdf(
     scene = scene.replace(spread=_spread(scene, proposals.spread), success=_success(scene))
     steps = tuple(measured_steps(scene)) if proposals.measured else ()
     messages = [str(each.message).removeprefix("URDF: ") for each in caught]
+    if scene.spread.joint_angles < _ROOMY * proposals.spread:
+        room, narrow = min((room, link.name) for link, room in _rooms(scene))
+        messages.append(
+            f"spread: starts of all joints are within {scene.spread.joint_angles:g} rad (m), where "
+            f"{proposals.spread:g} was asked: {narrow} is {room:.2g} from a stop"
+        )
     if steps:
         best = best_of(steps)
         scene = best.of(scene)
@@ -142,16 +150,13 @@ def import_urdf(
     written = {joint.child: joint.effort for joint in read_robot(path).joints.values()}
     efforts = tuple(written[link.name] if link.actuated else None for link in scene.links)
     added = (arguments.get("spacecraft") or {}).get("mass", 0.0)
-    return Imported(scene, (*messages, *warnings_of(scene)), efforts, added, steps)
+    torque: float | None = arguments.get("joint_torque")
+    return Imported(scene, (*messages, *warnings_of(scene)), efforts, added, steps, torque)
 
 
 def _spread(scene: Scene, width: float) -> dict[str, float]:
     """Draws of the start: the joints within their limits, the base where anything makes up for it."""
-    angles = scene.initial_state.joint_angles
-    room = min(
-        min(angle - lower, upper - angle)
-        for angle, (lower, upper, _) in zip(angles, joint_limits(scene), strict=True)
-    )
+    room = min(room for _, room in _rooms(scene))
     actuators = scene.actuators
     pushed = actuators.base_force or actuators.thrusters
     turned = pushed or actuators.base_torque or actuators.wheels or tip_directions(scene) == 6
@@ -160,6 +165,13 @@ def _spread(scene: Scene, width: float) -> dict[str, float]:
         "base_rotation": width if turned else 0.0,
         "base_position": width if pushed else 0.0,
     }
+
+
+def _rooms(scene: Scene) -> Iterator[tuple[Link, float]]:
+    """Links, each with the distance of its joint from the nearest stop at the start, rad (m)."""
+    start = zip(scene.links, scene.initial_state.joint_angles, joint_limits(scene), strict=True)
+    for link, angle, (lower, upper, _) in start:
+        yield link, min(angle - lower, upper - angle)
 
 
 def _success(scene: Scene) -> dict[str, float]:
@@ -299,8 +311,11 @@ def _scaled(imported: Imported) -> Iterator[str]:
         )
     pairs = zip(own, imported.scene.links, strict=True)
     free = [link.name for before, link in pairs if before is None and link.actuated]
-    if free:
-        yield f"          the file has no effort for {', '.join(free)}: --joint-torque gives another limit"
+    if free and imported.joint_torque is None:
+        yield (
+            f"          the file has no effort, or 1e4 and more, for {', '.join(free)}: --joint-torque gives "
+            "another limit"
+        )
 
 
 def _steps(imported: Imported) -> Iterator[str]:

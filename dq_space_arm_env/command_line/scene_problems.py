@@ -1,4 +1,4 @@
-"""Every problem of a scene file, with its line."""
+"""Problems of a scene file, with their lines."""
 
 from pathlib import Path
 from typing import NamedTuple

@@ -19,7 +19,7 @@ _HEADER = """\
 # A scene: a spacecraft with an arm, and its maneuver.
 # SI units: m, kg, s, rad, N, N m. Quaternions are [w, x, y, z]; a rotation may also be written as
 # {axis: [x, y, z], angle: degrees}. Missing keys take their defaults.
-# `dq-space-arm scenes validate FILE` lists every problem of this file with its line.
+# `dq-space-arm scenes validate FILE` lists the problems of this file with their lines.
 """
 
 

@@ -31,7 +31,7 @@ from dq_space_arm_env.common.files import check_writable_file
           dq-space-arm scenes list                       # the scenes that ship
           dq-space-arm scenes show planar                # bodies, states, inputs, absent parts
           dq-space-arm scenes new my.yaml --from planar  # a commented file to edit
-          dq-space-arm scenes validate my.yaml           # every problem, with its line
+          dq-space-arm scenes validate my.yaml           # problems, with their lines
           dq-space-arm scenes import robot.urdf --tip hand
     """,
 )
@@ -96,7 +96,7 @@ def show(scene: str, as_json: bool) -> None:
 @click.argument("files", nargs=-1, required=True, type=SCENE, metavar="FILE...")
 @json_option
 def validate(files: tuple[str, ...], as_json: bool) -> int:
-    """Check scene files; list every problem with its line and field. Exit status 1: problems found.
+    """Check scene files; list problems with their lines and fields. Exit status 1: problems found.
 
     Warnings say what is valid and unwise: joints too stiff for the integrator, targets out of reach, limits
     of torques out of proportion, numbers that look like grams, millimeters or degrees.
@@ -294,12 +294,16 @@ def _write(path: Path, text: str) -> None:
     is_flag=True,
     help="Solve and fly the first maneuver, and open its replay in the browser: as the scene, .html.",
 )
-@click.option("--lock-branches", is_flag=True, help="Hold all joints beside the arm at zero.")
+@click.option(
+    "--lock-branches",
+    is_flag=True,
+    help="Hold all joints beside the arm at zero, or at the limit nearest to it.",
+)
 @click.option(
     "--lock",
     type=PartOf("joint", "robot"),
     multiple=True,
-    help="Joint beside the arm, such as a gripper's, to hold at zero; may be repeated.",
+    help="Joint beside the arm, such as a gripper's, to hold likewise; may be repeated.",
 )
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @json_option
@@ -338,7 +342,7 @@ def import_(
     from dq_space_arm_env.command_line import scene_exchange
     from dq_space_arm_env.command_line.scene_template import commented_yaml
 
-    path = _scene_file(out or f"{Path(robot).stem}.yaml", force, robot)
+    path = _scene_file(out or f"{Path(robot).stem}.yaml", force or tip is None, robot)
     arguments["name"] = arguments.get("name") or path.stem
     if replay:
         check_writable_file(path.with_suffix(".html"))

@@ -44,10 +44,18 @@ def start_angles(arm: Arm) -> list[float]:
 def _at_rest(joint: UrdfJoint) -> float:
     """Zero, at some distance from limits near it, or midway between them where they exclude it."""
     lower, upper = joint.limits or ANY_ANGLE
-    middle, room = 0.5 * (lower + upper), min(_ROOM, 0.5 * (upper - lower))
+    middle = 0.5 * (lower + upper)
     if not lower <= 0.0 <= upper and math.isfinite(middle):
         return middle
-    return min(max(0.0, lower + room), upper - room)
+    lowest, highest = _off_stops(joint)
+    return min(max(0.0, lowest), highest)
+
+
+def _off_stops(joint: UrdfJoint) -> tuple[float, float]:
+    """Smallest and largest angle at some distance from the stops."""
+    lower, upper = joint.limits or ANY_ANGLE
+    room = min(_ROOM, 0.5 * (upper - lower))
+    return lower + room, upper - room
 
 
 def _moved(joint: UrdfJoint, angle: float, step: float) -> float | None:
@@ -57,12 +65,12 @@ def _moved(joint: UrdfJoint, angle: float, step: float) -> float | None:
 
 
 def _bent(joint: UrdfJoint) -> float:
-    """Angle at rest and the bend, where the limits allow it; a slide does not bend."""
-    angle = _at_rest(joint)
+    """Angle at rest and the bend, or what the limits allow of it; a slide does not bend."""
+    angle, (lowest, highest) = _at_rest(joint), _off_stops(joint)
     if joint.slides:
         return angle
-    bent = _moved(joint, angle, _BEND)
-    return angle if bent is None else bent
+    upward, downward = min(angle + _BEND, highest), max(angle - _BEND, lowest)
+    return round(upward if upward - angle >= angle - downward else downward, 12)
 
 
 def _dexterity(arm: Arm, angles: Sequence[float]) -> float:
@@ -141,13 +149,8 @@ def with_scaled_limits(scene: Scene, kept: Collection[str] = ()) -> Scene:
 
 def displaced(part: ArmJoint, coordinate: float) -> Pose:
     """Pose of a joint's frame, turned or slid by its coordinate, in the frame before."""
-    motion = kinematics.joint_motion(SCREWS[joint_type(part.joint)], coordinate)
+    motion = kinematics.joint_motion(SCREWS[part.joint.joint_type], coordinate)
     return tuple(dual_quaternion.multiply(part.pose, motion))
-
-
-def joint_type(joint: UrdfJoint) -> str:
-    """The joint's type in a scene."""
-    return "prismatic" if joint.slides else "revolute"
 
 
 def written_pose(pose: Pose) -> dict[str, Any]:

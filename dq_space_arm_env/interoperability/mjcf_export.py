@@ -80,7 +80,7 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     world = Element("worldbody")
     looks.add_surroundings(root, world, scene)
     root.append(world)
-    base = SubElement(world, "body", name=free_name("base", names))
+    base = SubElement(world, "body", name="base")
     _add_base_joint(base, scene)
     _add_inertial(base, scene.base, (0.0, 0.0, 0.0))
     looks.add_base(base, scene.base)
@@ -95,7 +95,7 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
             _add_joint(body, link, lower, upper)
         _add_inertial(body, link, link.center_of_mass)
     looks.add_arm(bodies, scene)
-    target = free_name("target", [*names, base.get("name", "")])
+    target = free_name("target", names)
     sites = ["e0", "tip", target]
     names += [free_name("payload", names)]
     _add_tip(bodies[scene.tip_body], scene, "tip", tip_on_its_body(scene), (names[-1], scene.payload))

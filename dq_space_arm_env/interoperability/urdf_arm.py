@@ -16,6 +16,8 @@ import numpy as np
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.algebra.quaternion import normalize
+from dq_space_arm_env.dynamics.kinematic_tree import SCREWS
+from dq_space_arm_env.dynamics.kinematics import joint_motion
 from dq_space_arm_env.interoperability.rigid_body import Array, Body, balanced, lumped
 from dq_space_arm_env.interoperability.urdf_elements import MOVABLE, UNLIMITED, Pose, UrdfJoint, UrdfRobot
 from dq_space_arm_env.scene import SceneError
@@ -204,8 +206,8 @@ class UrdfTree:
         missing = missing_efforts(driven)
         raise SceneError(
             f"URDF: beside the way from base to tip, where it moves a mass, {named}; in a scene every joint "
-            f"moves by itself and is {', '.join(MOVABLE)} or fixed; lock_branches={held} holds such joints "
-            f"at zero, lock_branches=True all{missing and f'; {missing}'}"
+            f"moves by itself and is {', '.join(MOVABLE)} or fixed; lock_branches={held} holds such joints, "
+            f"lock_branches=True all{missing and f'; {missing}'}"
         )
 
     def _hanging(self, body: str, moving: list[UrdfJoint], locked: Collection[str]) -> dict[UrdfJoint, bool]:
@@ -241,10 +243,32 @@ class UrdfTree:
                     if not self._has_mass_beyond(joint, here):
                         continue
                     self._check_locked(joint, moving)
-                step = joint.origin if down else dual_quaternion.conjugate(joint.origin)
-                found[there] = dual_quaternion.multiply(found[here], step)
+                step = self._held(joint)
+                found[there] = dual_quaternion.multiply(
+                    found[here], step if down else dual_quaternion.conjugate(step)
+                )
                 waiting.append(there)
         return found
+
+    def _held(self, joint: UrdfJoint) -> Pose:
+        """Pose of a joint's child in its parent, fixed or locked."""
+        coordinate = self._locked_at(joint)
+        if coordinate == 0.0:
+            return joint.origin
+        along = _turned_to(joint.axis)
+        motion = joint_motion(SCREWS[joint.joint_type], coordinate)
+        back = dual_quaternion.multiply(motion, dual_quaternion.conjugate(along))
+        return dual_quaternion.multiply(joint.origin, dual_quaternion.multiply(along, back))
+
+    def _locked_at(self, joint: UrdfJoint) -> float:
+        """Coordinate of a locked joint: zero or its nearest limit, or what it mimics makes of that."""
+        followed, ratio, offset = [joint], 1.0, 0.0
+        while (leader := self.robot.joints.get(followed[-1].mimics or "")) and leader not in followed:
+            offset += ratio * followed[-1].offset
+            ratio *= followed[-1].ratio
+            followed.append(leader)
+        lower, upper = followed[-1].limits or (0.0, 0.0)
+        return ratio * min(max(0.0, lower), upper) + offset
 
     def _has_mass_beyond(self, joint: UrdfJoint, link: str) -> bool:
         return any(self.robot.links[name].body is not None for name in self._beyond(joint, link))

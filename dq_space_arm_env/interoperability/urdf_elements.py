@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -64,7 +65,9 @@ class UrdfJoint:
     rate: float  # largest rate, rad/s; infinite for none
     damping: float  # viscous, N m s/rad
     friction: float  # Coulomb, N m
-    mimics: str | None  # the joint that it follows
+    mimics: str | None  # the joint that it follows: its coordinate times `ratio`, and `offset`
+    ratio: float
+    offset: float  # rad (m)
 
     @property
     def slides(self) -> bool:
@@ -75,6 +78,11 @@ class UrdfJoint:
     def unit(self) -> str:
         """Unit of its coordinate."""
         return "m" if self.slides else "rad"
+
+    @property
+    def joint_type(self) -> str:
+        """Its type in a scene."""
+        return "prismatic" if self.slides else "revolute"
 
 
 @dataclass(frozen=True)
@@ -204,6 +212,8 @@ def _read_joint(element: Element) -> UrdfJoint:
         damping=damping,
         friction=friction,
         mimics=None if mimic is None else _required(mimic, "joint", f"{where}, <mimic>"),
+        ratio=_optional(mimic, "multiplier", f"{where}, <mimic>", 1.0),
+        offset=_optional(mimic, "offset", f"{where}, <mimic>"),
     )
 
 
@@ -290,8 +300,8 @@ def _number(element: Element, key: str, where: str) -> float:
     return _numbers(_required(element, key, where), 1, key, where)[0]
 
 
-def _optional(element: Element | None, key: str, where: str) -> float:
-    return 0.0 if element is None or key not in element.attrib else _number(element, key, where)
+def _optional(element: Element | None, key: str, where: str, default: float = 0.0) -> float:
+    return default if element is None or key not in element.attrib else _number(element, key, where)
 
 
 def _direction(element: Element, where: str) -> tuple[float, ...]:
@@ -304,10 +314,10 @@ def _vector(element: Element, key: str, where: str, count: int = 3) -> tuple[flo
 
 
 def _numbers(text: str, count: int, key: str, where: str, *, largest: float = _LARGEST) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(word) for word in text.split())
-    except ValueError:
-        numbers = ()
+    numbers: tuple[float, ...] = ()
+    if text.isascii() and "_" not in text:  # which Python would read
+        with suppress(ValueError):
+            numbers = tuple(float(word) for word in text.split())
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
         wanted = "a finite number" if count == 1 else f"{count} finite numbers"
         raise SceneError(f"URDF: {where}: {key} = {shortened(text)}, it must be {wanted}")

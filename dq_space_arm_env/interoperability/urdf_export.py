@@ -55,7 +55,7 @@ def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     root = Element("robot", name=scene.name)
     names = [link.name for link in scene.links]
     others = [tip.name for tip in scene.other_tips]
-    bodies = [free_name("base", [*names, *others]), *names]
+    bodies = ["base", *names]
     _add_link(root, bodies[0], scene.base, (0.0, 0.0, 0.0))
     limits = joint_limits(scene)
     for link, parent, effort, bounds in zip(

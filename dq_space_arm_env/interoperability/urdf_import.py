@@ -15,7 +15,6 @@ from dq_space_arm_env.dynamics.step_stability import stable
 from dq_space_arm_env.interoperability.first_maneuver import (
     ANY_ANGLE,
     default_target,
-    joint_type,
     start_angles,
     with_scaled_limits,
     with_torque_weights,
@@ -84,8 +83,8 @@ def scene_from_urdf(
             refuses such joints, unless `scaled_efforts` finds limits for them.
         passive: Names of the joints that have no motor.
         lock_branches: Names of movable joints beside the way from base to tip, as those of a gripper or of
-            another arm, that are held at zero; True for all of them. Others that move a mass are joints of
-            the scene.
+            another arm, that are held at zero, or the limit nearest to it; what mimics another follows it.
+            True for all of them. Others that move a mass are joints of the scene.
         target: Pose of the target as in a scene, {"position": ..., "rotation": ...} in m; by default the pose
             of the tip at the start but with every joint 0.3 rad further, or back where its limits ask for it.
         balance_inertias: Whether to mend inertias that violate the triangle inequality, with a warning, by
@@ -117,9 +116,9 @@ def scene_from_urdf(
     _check_passive(arm, passive)
     _warn(arm)
     tip_link = None if arm.way == len(arm.joints) else arm.joints[arm.way - 1].joint.child
-    if tip_link == BASE:
+    if BASE in (part.joint.child for part in arm.joints):
         raise SceneError(
-            f"URDF: link {BASE!r}, which carries the tip, has the name of a scene's spacecraft: rename it"
+            f"URDF: link {BASE!r}, which a joint moves, has the name of a scene's spacecraft: rename it"
         )
     center = ", ".join(f"{round(float(number), 6) + 0.0:.6g}" for number in arm.base_center)
     frame = f"link {arm.base_link}" if mount == HERE else "the spacecraft"
@@ -263,7 +262,7 @@ def _link(
         "inertia": tidied(part.body.inertia).tolist(),
         "center_of_mass": tidied(part.body.center_of_mass).tolist(),
         "joint": written_pose(part.pose),
-        "joint_type": joint_type(joint),
+        "joint_type": joint.joint_type,
         "actuated": driven,
         "torque_limit": (joint.effort or joint_torque) if driven else None,
         "damping": joint.damping if dampers else 0.0,

@@ -207,7 +207,6 @@ class Scene(Model):
     def _tree_problems(self) -> Iterator[Problem]:
         """Find links whose parents are not before them, names given twice, and a tip on nothing."""
         names = [link.name for link in self.links]
-        carriers = [self.tip_link, *(tip.link for tip in self.other_tips)]
         for index, (link, parent) in enumerate(zip(self.links, parent_bodies(self.links), strict=True)):
             if parent is None:
                 before = ", ".join([BASE, *names[:index]])
@@ -216,9 +215,8 @@ class Scene(Model):
             if link.name in names[:index]:
                 sentence = "another link has this name: each needs its own"
                 yield Problem(("links", index, "name"), link.name, sentence)
-            elif link.name == BASE and (any(each.parent for each in self.links) or BASE in carriers):
-                sentence = "is the spacecraft's, which links name as their parent or tips: rename the link"
-                yield Problem(("links", index, "name"), link.name, sentence)
+            elif link.name == BASE:
+                yield Problem(("links", index, "name"), link.name, "is the spacecraft's: rename the link")
         if self.tip_link is not None and self.tip_link not in (BASE, *names):
             sentence = f"must be one of {', '.join([BASE, *names])}"
             yield Problem(("tip_link",), self.tip_link, sentence)

@@ -169,7 +169,7 @@ def test_jets_sit_on_flat_spacecraft_too(here: Path) -> None:
     assert np.linalg.matrix_rank(jets) == 6
 
 
-def test_starts_are_drawn_within_the_limits(here: Path) -> None:
+def test_starts_are_drawn_within_the_limits(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = Path(ARM).read_text(encoding="utf-8").replace('lower="-3" upper="3"', 'lower="0" upper="0.1992"')
     Path("arm.urdf").write_text(text, encoding="utf-8")
     words = ["scenes", "import", "arm.urdf", "--tip", "hand", *CARRIED, "--spread", "0.1", "--no-measure"]
@@ -177,6 +177,10 @@ def test_starts_are_drawn_within_the_limits(here: Path) -> None:
     scene = load_scene("arm.yaml")
     assert scene.initial_state.joint_angles[0] == pytest.approx(0.0996)
     assert 0.09 < scene.spread.joint_angles < 0.0996
+    assert "of all joints" not in capsys.readouterr().err
+    assert main([*words, "--force", "--spread", "0.2"]) == SUCCESS
+    warning = " ".join(capsys.readouterr().err.split())
+    assert "within 0.095 rad (m), where 0.2 was asked: upper arm is 0.1 from a stop" in warning
 
 
 def test_stiff_dampers_take_short_steps_or_a_stiff_method(
@@ -300,7 +304,9 @@ def test_fingers_that_others_mimic_are_no_tips(here: Path, capsys: pytest.Captur
         text += f'<parent link="hand"/><child link="{name}"/>'
         text += f'<mimic joint="{mimics}"/></joint>' if mimics else "</joint>"
     Path("gripper.urdf").write_text(f"{text}</robot>", encoding="utf-8")
+    Path("gripper.yaml").touch()  # is not written
     assert main(["scenes", "import", "gripper.urdf"]) == UNUSABLE
+    Path("gripper.yaml").unlink()
     listed = " ".join(capsys.readouterr().err.split())
     assert re.search(": hand 2 joints, .* others mount, upper arm, forearm, finger, other, dial$", listed)
     assert main(["scenes", "import", "gripper.urdf", "--tip", "finger", *CARRIED]) == UNUSABLE
@@ -380,14 +386,16 @@ def test_warnings_and_the_options_that_help(here: Path, capsys: pytest.CaptureFi
     Path("planar.urdf").write_text(planar, encoding="utf-8")
     assert main(["scenes", "import", "planar.urdf", *words[3:]]) == UNUSABLE
     message = capsys.readouterr().err
-    assert "--lock 'my f' holds such joints at zero, --lock-branches all; no effort limit for" in message
+    assert "--lock 'my f' holds such joints, --lock-branches all; no effort limit for" in message
     assert main(words) == UNUSABLE
     assert "no effort limit for joint elbow, f: give --joint-torque, N m, for all" in capsys.readouterr().err
     assert main([*words, "--lock-branches"]) == UNUSABLE
     assert "no effort limit for joint elbow: give --joint-torque, N m, for all" in capsys.readouterr().err
     assert main([*words[:-1], "--lock-branches"]) == SUCCESS
     printed = " ".join(capsys.readouterr().out.split())
-    assert "the file has no effort for forearm: --joint-torque gives another limit" in printed
+    assert (
+        "the file has no effort, or 1e4 and more, for forearm: --joint-torque gives another limit" in printed
+    )
     scene = load_scene("gripper.yaml")
     limits = [3.0 * effort for effort in swing_efforts(scene)]
     assert scene.links[1].torque_limit == pytest.approx(limits[1], rel=0.05)

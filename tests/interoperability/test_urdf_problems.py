@@ -93,7 +93,7 @@ FINGERS = (
         (arm(content=""), "no effort limit for joint j1: give joint_torque"),
         (
             robot(*GOOD, joint("j2", "base", "b", "planar"), B),
-            r"beside the way .*, joint 'j2' is planar; .* lock_branches=\['j2'\] holds such joints at zero",
+            r"beside the way .*, joint 'j2' is planar; .* lock_branches=\['j2'\] holds such joints, lock",
         ),
         (
             robot(*GOOD, joint("j2", "base", "b", content=MIMIC), B),
@@ -163,12 +163,47 @@ def test_wrong_arguments_are_refused(arguments, sentence):
         scene_from_urdf(robot(*GOOD), **arguments)
 
 
-def test_a_tip_on_a_link_called_as_the_spacecraft_is_refused():
-    """In the scene its tip would be on the spacecraft."""
+def test_a_moving_link_called_as_the_spacecraft_is_refused():
     parts = link("bus"), joint("j1", "bus", "base"), BASE, joint("j2", "base", "arm"), ARM
-    with pytest.raises(SceneError, match=r"link 'base', which carries the tip, .* rename it"):
-        scene_from_urdf(robot(*parts), "base")
-    assert scene_from_urdf(robot(*parts), "arm").tip_body == 2
+    for tip in ("base", "arm"):
+        with pytest.raises(SceneError, match=r"link 'base', which a joint moves, .* rename it"):
+            scene_from_urdf(robot(*parts), tip)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "follows", "held"),
+    [
+        (-1.0, 1.0, "", (0.0, 0.0)),
+        (0.3, 1.0, "", (0.3, 0.0)),
+        (-1.0, -0.2, 'joint="s" multiplier="-2" offset="0.5"', (-0.2, 0.9)),
+    ],
+)
+def test_locked_joints_are_held_where_they_can_be(lower, upper, follows, held):
+    """At zero or the nearest limit, and followers where those put them; as arms whose links are there."""
+    aside = BODY.replace("<mass", '<origin xyz="1 0 0"/><mass')
+
+    def hand(kinds, slide, turn):
+        joints = joint("s", "arm", "l", kinds[0], slide), joint("t", "arm", "r", kinds[1], turn)
+        return robot(*GOOD, *joints, link("l"), link("r", aside))
+
+    slide = f'<axis xyz="0 1 0"/><limit lower="{lower}" upper="{upper}"/>'
+    turn = f'<axis xyz="0 0 -1"/>{follows and f"<mimic {follows}/>"}'
+    moving = hand(("prismatic", "continuous"), slide, turn)
+    there = f'<origin xyz="0 {held[0]} 0"/>', f'<origin rpy="0 0 {-held[1]}"/>'
+    standing = hand(("fixed", "fixed"), *there)
+    found, expected = (
+        scene_from_urdf(text, "arm", lock_branches=True).links[0] for text in (moving, standing)
+    )
+    assert found.center_of_mass == pytest.approx(expected.center_of_mass, abs=1e-14)
+    np.testing.assert_allclose(found.inertia, expected.inertia, atol=1e-13)
+
+
+@pytest.mark.parametrize("number", ["1_5", "٣", "0x1", "1,5"])
+def test_numbers_are_those_of_xml(number):
+    with pytest.raises(
+        SceneError, match=r"link 'arm', <inertial>, <mass>: value = .*, it must be a finite number"
+    ):
+        scene_from_urdf(robot(*GOOD[:2], link("arm", body(number))), "arm")
 
 
 def test_a_locked_joint_must_not_follow_the_chain():
@@ -326,6 +361,8 @@ def test_a_straight_arm_begins_bent_within_its_limits():
     ]
     scene = scene_from_urdf(robot(*map(link, names), *joints), "hand")
     assert scene.initial_state.joint_angles == (0.5, -0.5, 0.5)
+    narrow = robot(*map(link, names), *joints).replace('lower="-3" upper="3"', 'lower="-0.6" upper="0.5"')
+    assert scene_from_urdf(narrow, "hand").initial_state.joint_angles == (0.5, -0.5, -0.4)  # off its stops
     two = scene_from_urdf(robot(*map(link, names[:3]), *joints[:2]), "two")
     assert two.initial_state.joint_angles == (0.0, 0.0)  # each moves the tip in its own way
 
@@ -417,11 +454,11 @@ def test_other_tips_keep_their_payloads():
 
 def test_names_of_our_own_make_way():
     scene = load_scene("no-wrist")
-    names = ("base", "tip", "tip_")
+    names = ("bus", "tip", "tip_")
     scene = scene.replace(
         links=[{**part.model_dump(), "name": name} for part, name in zip(scene.links, names, strict=True)]
     )
-    again = scene_from_urdf(scene_to_urdf(scene), "tip__", "base_")
+    again = scene_from_urdf(scene_to_urdf(scene), "tip__")
     assert [part.name for part in again.links] == list(names)
 
 
