@@ -51,11 +51,13 @@ def merged(present: Any, change: Any, location: tuple[str | int, ...] = ()) -> A
         return fields | {
             key: merged(fields.get(key), value, (*location, key)) for key, value in change.items()
         }
-    positions = [place for key in change if (place := list_position(key)) is not None]
-    if isinstance(present, tuple) and len(positions) == len(change):
+    by_position = all(list_position(key) is not None for key in change)
+    # A vector may be written as a mapping, an axis and an angle; a list of parts may not.
+    if isinstance(present, tuple) and (by_position or any(isinstance(part, Model) for part in present)):
         entries = list(present)
-        for position, (key, value) in zip(positions, change.items(), strict=True):
-            if position >= len(entries):
+        for key, value in change.items():
+            position = list_position(key)
+            if position is None or position >= len(entries):
                 here = field_path(location)
                 raise ChangeError(
                     f"{here} has {len(entries)} entries, the first is 0; there is no {shortened(key)}"

@@ -266,7 +266,8 @@ def test_replace_takes_paths() -> None:
     ("changes", "sections", "said"),
     [
         ({"links.3.mass": 4}, {}, "links has 3 entries, the first is 0; there is no '3'"),
-        ({"links.first.mass": 4}, {}, "links = .*: must be a list"),
+        ({"links.first.mass": 4}, {}, "links has 3 entries, the first is 0; there is no 'first'"),
+        ({"links.-1.mass": 4}, {}, "there is no '-1'"),
         ({"links.0.mas": 4}, {}, r"links\[0\]\.mas: unknown key; did you mean 'mass'"),
         ({"cots.pose": 4}, {}, "cots: unknown key; did you mean 'cost'"),
         ({"cost.pose.99": 4}, {}, r"cost\.pose has 8 entries"),
