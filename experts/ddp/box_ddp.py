@@ -180,7 +180,6 @@ class BoxDDP:
             shooting = self._multiple_shooting()
             guess = initial_state, shooting.check(x_init), controls
             stop = shooting.close_gaps(guess, state, self.max_iterations, callback)
-        state.first_cost = work.current.cost
         if work.current.failing_stage != FINISHED:
             message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
             return self._solution(state, Stop(StopReason.DIVERGED, message), np.zeros_like(work.update.K))
@@ -250,9 +249,7 @@ class BoxDDP:
                 StopReason.REGULARIZATION_LIMIT,
                 f"the model at stage {direction.stage} is not convex at the largest regularization",
             )
-        if self._relative_reduction(state, direction) <= self.tolerance and self._is_optimal(
-            state, direction
-        ):
+        if self._relative_reduction(direction) <= self.tolerance and self._is_optimal(state, direction):
             return Stop(StopReason.CONVERGED, CONVERGED)
         return state.iteration_limit(self.max_iterations)
 
@@ -268,18 +265,18 @@ class BoxDDP:
             direction = self._work.backward_pass(0.0, exact=self._directions.has_exact)
             if not direction.completed:
                 return False
-        state.optimality = self._relative_reduction(state, direction)
+        state.optimality = self._relative_reduction(direction)
         if state.optimality <= self.tolerance:
             return True
         self._work.restore_update()
         return False
 
-    def _relative_reduction(self, state: SolverState, direction: PassResult) -> float:
+    def _relative_reduction(self, direction: PassResult) -> float:
         """Relate the predicted reduction of the full step to the cost; zero if rounding hides it."""
         reduction = direction.predicted_reduction(1.0)
         if reduction <= self._work.cost_rounding():
             return 0.0
-        return reduction / state.cost_scale(self._work.current.cost)
+        return _relative(reduction, self._work.current.cost)
 
     def _record(
         self, state: SolverState, direction: PassResult, cost: float, alpha: float, started: float
@@ -293,7 +290,7 @@ class BoxDDP:
             exact=direction.exact,
             regularization=direction.mu,
             expected_decrease=reduction,
-            optimality=reduction / state.cost_scale(cost),
+            optimality=_relative(reduction, cost),
             clamped_share=direction.clamped / work.current.controls.size,
             seconds=perf_counter() - started,
             derivative_seconds=work.time.derivatives,
@@ -338,7 +335,7 @@ class BoxDDP:
                 message += "; there are no feedback gains, they are zero"
                 return self._solution(state, Stop(reason, message), np.zeros_like(work.update.K))
             if direction.mu == 0.0 and direction.exact == self._directions.has_exact:
-                state.optimality = self._relative_reduction(state, direction)
+                state.optimality = self._relative_reduction(direction)
             if state.optimality <= self.tolerance and reason is not StopReason.INTERRUPTED:
                 reason, message = StopReason.CONVERGED, CONVERGED
         if np.isfinite(state.optimality):
@@ -397,3 +394,8 @@ class BoxDDP:
                 f"of input {i}; clip the guess to the bounds first"
             )
         return state, controls
+
+
+def _relative(reduction: float, cost: float) -> float:
+    """Relate a reduction to a cost, however small."""
+    return reduction / max(abs(cost), float(np.finfo(np.float64).tiny))

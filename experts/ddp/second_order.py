@@ -44,9 +44,6 @@ LARGEST_MU = 1e10
 LONG_STEP = 1.0  # an accepted step length from here on decreases mu: the full step only
 SHORT_STEP = 0.2  # one below it, or no step at all, increases mu
 
-COST_FLOOR = 1e-9
-"""Costs below this share of the first one count as zero in relative measures."""
-
 
 class SecondOrder(StrEnum):
     """Second derivatives that the solver uses."""
@@ -169,16 +166,11 @@ class SolverState:
     regularization: Regularization  # of the only model, or of Gauss-Newton's in the hybrid
     switch: HybridSwitch = field(default_factory=HybridSwitch)
     exact_regularization: ExactRegularization = field(default_factory=ExactRegularization)
-    first_cost: float = 0.0  # of the first trajectory without gaps
     moved: bool = True  # whether the trajectory has changed since it was differentiated
     optimality: float = np.inf  # predicted relative reduction of an unregularized step, inf where unknown
     idle_iterations: int = 0  # consecutive ones that hardly reduced the cost
     note: str = ""  # for the message: how gaps were closed that no step closed
     records: list[IterationRecord] = field(default_factory=list)
-
-    def cost_scale(self, cost: float) -> float:
-        """Return a positive number to relate changes of a cost to, however small the cost is."""
-        return max(abs(cost), COST_FLOOR * abs(self.first_cost), float(np.finfo(np.float64).tiny))
 
     def iteration_limit(self, max_iterations: int) -> Stop | None:
         """Stop if the iterations are used up."""

@@ -56,6 +56,26 @@ def test_unconstrained_problem_is_solved_in_one_unregularized_step(system):
     np.testing.assert_allclose(solution.controls[0], gains[0] @ x0, rtol=1e-9)
 
 
+def test_costs_of_an_unstable_first_rollout_are_no_measure_of_the_optimum(double_integrator):
+    """From zero controls the cost is 1e20 times the optimum; with all of that as scale any step would do."""
+    unstable = replace(double_integrator, A=double_integrator.A + 0.2 * np.eye(2), horizon=140)
+    _, P = riccati_gains(unstable)
+    optimum = 0.5 * unstable.initial_state @ P @ unstable.initial_state
+    assert BoxDDP(unstable.problem(), max_iterations=0).solve().cost > 1e20 * optimum
+    solution = BoxDDP(unstable.problem()).solve()
+    assert solution.converged
+    assert solution.cost == pytest.approx(optimum, rel=1e-7)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_a_maneuver_that_costs_nothing_is_found(double_integrator, scale):
+    nothing = np.zeros(2)
+    system = replace(double_integrator, Q=scale * double_integrator.Q, R=scale * double_integrator.R)
+    solution = BoxDDP(system.problem()).solve(nothing, np.ones((system.horizon, 1)))
+    assert solution.converged
+    assert solution.cost < 1e-30 * scale
+
+
 def test_gains_at_rest_do_not_count_on_an_input_without_room(coupled_masses):
     held = 1
     problem, others = coupled_masses.problem(), np.arange(3) != held
