@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.policies import ExportedPolicy
-from agents.policies.pickled_arrays import PickledError, read_pickled
+from agents.policies.pickled_arrays import PickledError, as_array, read_pickled
 from agents.policies.tensor_files import TensorFileError, read_tensors
 from agents.zoo.normalization import are_missing
 from dq_space_arm_env.common.bounded_reading import parse_json, read_member
@@ -140,8 +140,7 @@ def sees_normalized(attributes: Mapping[str, Any]) -> bool:
         last = read_pickled(base64.b64decode(attributes["_last_obs"][":serialized:"]))
     except (LookupError, TypeError, ValueError, PickledError):
         return True
-    bounds = str(attributes["observation_space"].get("high", "")).strip("[]").split()[:4]
-    return are_missing(last, [float(bound) for bound in bounds])
+    return are_missing(last, _bounds(attributes["observation_space"], "high").tolist())
 
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -224,16 +223,28 @@ def _layers(
 
 
 def _action_scale(space: Mapping[str, Any], n_action: int) -> NDArray[np.float64]:
-    """Largest actions, shape (n_u,), from the text of a symmetric box."""
-    low, high = (
-        np.array([float(number) for number in space[key].strip("[]").split()]) for key in ("low", "high")
-    )
+    """Largest actions, shape (n_u,), of a symmetric box."""
+    low, high = (_bounds(space, name) for name in ("low", "high"))
     if high.shape != (n_action,) or not np.array_equal(low, -high) or not (high <= 1.0).all():
         raise NeedsCodeError(
-            f"its actions are in [{space['low'][:80]}, {space['high'][:80]}], should be {n_action} symmetric "
+            f"its actions are in [{str(low)[:80]}, {str(high)[:80]}], should be {n_action} symmetric "
             "ranges, at most 1"
         )
     return high
+
+
+def _bounds(space: Mapping[str, Any], name: str) -> NDArray[np.float64]:
+    """Bounds of a box, "low" or "high", shape (n,); none of other spaces.
+
+    They are read from its pickle: the text beside it has as few digits as NumPy was set to print.
+    """
+    box = read_pickled(base64.b64decode(space[":serialized:"]))
+    if name not in box.state:
+        return np.zeros(0)
+    found = as_array(box.state[name])
+    if found is None or found.ndim > 1:
+        raise ValueError(f"{name} of a space is no vector")
+    return found
 
 
 def environment_scale(space: Any, n_action: int) -> NDArray[np.float64]:

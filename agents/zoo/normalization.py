@@ -106,6 +106,11 @@ def statistics_of(model: Any, file: str | Path | None = None) -> ObservationStat
             raise StatisticsError("the model has its VecNormalize in memory: leave normalize out")
         return _statistics(vars(normalizer))
     normalized = _sees_normalized(model)
+    if file is None and normalized is None:
+        raise StatisticsError(
+            "the model was given another environment since it learned, and does not tell whether its "
+            "observations were normalized by VecNormalize: load it without env, or give its file"
+        )
     if file is None and normalized:
         raise StatisticsError(
             "the model's observations were normalized by VecNormalize, which it was loaded without: "
@@ -122,24 +127,51 @@ def _check_wrappers(model: Any) -> None:
     environment: Any = getattr(model, "get_env", lambda: None)()
     while hasattr(environment, "venv"):
         environment = environment.venv
-    env = getattr(environment, "vector_env", next(iter(getattr(environment, "envs", ())), None))
-    while isinstance(env, gymnasium.Wrapper | VectorWrapper):
-        if isinstance(env, wrappers.NormalizeObservation):
-            raise StatisticsError(
-                "the model's observations pass Gymnasium's NormalizeObservation, whose statistics are not "
-                "read: train in VecNormalize of Stable-Baselines3"
-            )
-        if isinstance(env, gymnasium.ObservationWrapper) and not isinstance(env, _PLAIN_OBSERVATIONS):
-            raise StatisticsError(
-                f"the model's observations pass {type(env).__name__}, which only its environment applies: "
-                "give a function of plain observations that applies it before model.predict"
-            )
-        if isinstance(env, gymnasium.ActionWrapper) and _changes_actions(env):
-            raise StatisticsError(
-                f"the model's actions pass {type(env).__name__} of a single environment, which it does not "
-                "note: train in agents.SB3VecEnv with gymnasium.wrappers.vector.RescaleAction"
-            )
-        env = env.env
+    env: Any = getattr(environment, "vector_env", environment)
+    while env is not None:
+        if isinstance(env, gymnasium.Wrapper | VectorWrapper):
+            _check_wrapper(env)
+            env = env.env
+        elif getattr(env, "envs", ()):  # one for all
+            env = env.envs[0]
+        else:
+            _check_elsewhere(env)
+            return
+
+
+def _check_wrapper(env: gymnasium.Wrapper[Any, Any, Any, Any] | VectorWrapper) -> None:
+    if isinstance(env, wrappers.NormalizeObservation):
+        raise StatisticsError(
+            "the model's observations pass Gymnasium's NormalizeObservation, whose statistics are not "
+            "read: train in VecNormalize of Stable-Baselines3"
+        )
+    if isinstance(env, gymnasium.ObservationWrapper) and not isinstance(env, _PLAIN_OBSERVATIONS):
+        raise StatisticsError(
+            f"the model's observations pass {type(env).__name__}, which only its environment applies: "
+            "give a function of plain observations that applies it before model.predict"
+        )
+    if isinstance(env, gymnasium.ActionWrapper) and _changes_actions(env):
+        raise StatisticsError(
+            f"the model's actions pass {type(env).__name__} of a single environment, which it does not "
+            "note: train in agents.SB3VecEnv with gymnasium.wrappers.vector.RescaleAction"
+        )
+
+
+def _check_elsewhere(env: Any) -> None:
+    """Refuse wrappers in other processes, of which no more is known than that they are there."""
+    if getattr(env, "closed", False):
+        raise StatisticsError(
+            "the model's environments in other processes are closed, so that their wrappers cannot be seen: "
+            "evaluate and export it before"
+        )
+    kinds = gymnasium.ObservationWrapper, gymnasium.ActionWrapper
+    is_wrapped = getattr(env, "env_is_wrapped", lambda kind: [False])
+    spec = getattr(env, "spec", None)  # of an environment that `make_vec` has made
+    if any(any(is_wrapped(kind)) for kind in kinds) or (spec is not None and spec.kwargs.get("wrappers")):
+        raise StatisticsError(
+            "the model's observations or actions pass wrappers in other processes, which only its "
+            "environment applies: wrap in this process, or train in agents.SB3VecEnv with vector wrappers"
+        )
 
 
 def _changes_actions(env: gymnasium.ActionWrapper[Any, Any, Any]) -> bool:

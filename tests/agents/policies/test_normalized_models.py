@@ -14,7 +14,8 @@ from gymnasium import wrappers
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RescaleAction, TransformAction
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from agents import DQSpaceArmVecEnv, SB3VecEnv, compare, evaluate, export_policy
 from agents.policies.pickled_arrays import PickledError, as_array, read_pickled
@@ -72,6 +73,30 @@ def test_wrappers_of_single_environments_that_a_model_does_not_note_are_refused(
             as_policy(model)
     assert export_policy(model_in(rescaled)).action_scale.tolist() == [1.0] * 6  # which changes nothing
     as_policy(model_in(wrappers.FlattenObservation))
+
+
+@pytest.mark.parametrize("mode", ["sync", "async", "subprocesses"])
+@pytest.mark.parametrize("wrapper", [wrappers.NormalizeObservation, None])
+def test_wrappers_of_single_environments_are_seen_in_many(mode, wrapper, small_scene):
+    single = [] if wrapper is None else [wrapper]
+    if mode == "subprocesses":
+        make = {"env_kwargs": {"scene": small_scene}, "wrapper_class": wrapper}
+        environment = make_vec_env("DQSpaceArm-v0", 2, vec_env_cls=SubprocVecEnv, **make)
+    else:
+        modes = {"vectorization_mode": mode, "vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}}
+        environment = SB3VecEnv(
+            gymnasium.make_vec("DQSpaceArm-v0", 2, scene=small_scene, wrappers=single, **modes)
+        )
+    model = PPO("MlpPolicy", environment, n_steps=8, batch_size=8, device="cpu", policy_kwargs=dict(SMALL))
+    if wrapper is None:
+        export_policy(model)
+    else:
+        with pytest.raises(PolicyError, match=r"observations (pass|or actions pass)"):
+            as_policy(model)
+    environment.close()
+    if mode == "subprocesses":
+        with pytest.raises(PolicyError, match="are closed, so that their wrappers cannot be seen"):
+            as_policy(model)
 
 
 def observations(scene):
@@ -147,12 +172,18 @@ def test_a_file_is_no_model_to_export(normalized):
 def test_a_model_of_plain_observations_takes_no_statistics(kind, normalized, small_scene, tmp_path):
     environment = DQSpaceArmVecEnv(2, small_scene)
     model, file = trained(environment, kind), tmp_path / "plain.zip"
-    model.save(file)
+    with np.printoptions(precision=3, suppress=True):  # bounds of the spaces are in the file as text, too
+        model.save(file)
     for way in (model, file, kind.load(file)):
         as_policy(way)
         with pytest.raises(PolicyError, match="was trained on plain observations"):
             as_policy(way, normalize=normalized[2])
-    export_policy(kind.load(file, env=environment))
+    elsewhere = kind.load(file, env=environment)
+    if kind is SAC:  # which keeps as much of plain observations as of normalized ones
+        with pytest.raises(PolicyError, match=r"does not tell whether .* load it without env"):
+            as_policy(elsewhere)
+        elsewhere.learn(16)
+    export_policy(elsewhere)
 
 
 @pytest.mark.parametrize("verb", ["simulate", "replay", pytest.param("compare", marks=pytest.mark.slow)])
@@ -316,6 +347,15 @@ def test_rescaled_actions_fly_at_their_scale(kind, small_scene, tmp_path):
     assert np.abs(expected).max() > 0.0
     for way in (model, export_policy(model), tmp_path / "model.zip"):
         np.testing.assert_allclose(as_policy(way).act(seen), expected, rtol=0.0, atol=2e-6)
+
+
+def test_bounds_of_actions_do_not_depend_on_how_numbers_are_printed(small_scene, tmp_path):
+    model = trained(wrapped(small_scene, lambda env: ShrinkActionSpace(env, 0.003)), SAC)
+    with np.printoptions(precision=2, suppress=True):
+        model.save(tmp_path / "model.zip")
+    seen = observations(small_scene)
+    expected = model.predict(seen.astype(np.float32), deterministic=True)[0]
+    np.testing.assert_allclose(as_policy(tmp_path / "model.zip").act(seen), expected, rtol=0.0, atol=2e-9)
 
 
 def test_actions_that_pass_unknown_wrappers_are_refused(small_scene, tmp_path):
