@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from dq_space_arm_env.scene.constraints import ControlRate
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import CATCH, PHASE
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
-from dq_space_arm_env.scene.start import unit_quaternions
+from dq_space_arm_env.scene.start import episode_scene, unit_quaternions
 from experts.problems.shooting_problem import (
     FloatArray,
     Kernel,
@@ -99,7 +100,8 @@ class ArmProblem:
         changing = self._in_stages if entries.moving or entries.staged else None
         n_rows = n_multipliers(self.scene) if self.is_constrained else 0
         nominal = self.kernels.parameters.nominal
-        self.parameters = StageParameters(self.horizon, nominal, changing, 2 * n_rows)
+        check = partial(episode_scene, self.scene)
+        self.parameters = StageParameters(self.horizon, nominal, changing, 2 * n_rows, check)
         self.constraints = self.constraints_of(self.parameters)
         last = (rows[-1:] for rows in self.parameters.inputs)
         self.terminal_inputs: tuple[FloatArray, ...] = (*last, np.full(1, self._end_weight))

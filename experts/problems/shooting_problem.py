@@ -86,12 +86,17 @@ class StageParameters:
         nominal: ArrayLike = (),
         in_stages: Callable[[FloatArray], FloatArray] | None = None,
         n_more: int = 0,
+        check: Callable[[FloatArray], object] | None = None,
     ) -> None:
-        """Begin with nominal values; `in_stages` gives the rows (N + 1, n_p) that follow from the first."""
+        """Begin with nominal values.
+
+        `in_stages` gives the rows (N + 1, n_p) that follow from the first, and `check` raises ValueError for
+        values at the start, (n_p,), that mean nothing.
+        """
         self.nominal: FloatArray = np.array(nominal, dtype=np.float64)
         self._whole: FloatArray = np.zeros((horizon + 1, self.nominal.size + n_more))
         self.rows, self.more = np.split(self._whole, [self.nominal.size], axis=1)
-        self._in_stages = in_stages
+        self._in_stages, self._check = in_stages, check
         self.inputs: tuple[FloatArray, ...] = (self._whole,) if self._whole.size else ()
         self.set(None)
 
@@ -109,7 +114,8 @@ class StageParameters:
                 how they change; or one row per stage, (N + 1, n_p); None for the nominal ones.
 
         Raises:
-            ValueError: If they have another shape or are not finite.
+            ValueError: If they have another shape or are not finite, or those at the start mean nothing, as a
+                negative mass.
         """
         given = self.nominal if parameters is None else real_array("parameters", parameters, np.float64)
         if given.shape not in (self.nominal.shape, self.rows.shape):
@@ -118,6 +124,8 @@ class StageParameters:
                 "with a row for each stage"
             )
         check_array("parameters", given, given.shape)
+        if self._check is not None and parameters is not None and given.ndim == 1:
+            self._check(given)
         if self._in_stages is not None and given.ndim == 1:
             return self._in_stages(given)
         return np.broadcast_to(given, self.rows.shape)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import SceneError, load_scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene.start import episode_scene
-from experts import BoxDDP, GuidedDDP, Solution
+from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert, Solution
 from experts.problems.arm_problem import ArmProblem
 
 STEPS = 60
@@ -52,6 +52,20 @@ def test_a_solve_is_that_of_the_scene_with_these_numbers(scene, solver):
     assert nominal.cost == pytest.approx(
         BoxDDP(episode_scene(scene, nominal.parameters[0])).solve().cost, rel=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"links__0__mass": -1.0}, r"links\[0\].mass = -1.0"),
+        ({"actuators__joint_torque__limit": 0.0}, "joint_torque"),
+        ({"target": (1e300, 0.0)}, "target"),
+    ],
+)
+def test_parameters_that_no_scene_may_have_are_refused(solver, change, said):
+    for solve in (solver.solve, RecedingHorizonExpert(solver.problem.scene).reset):
+        with pytest.raises(SceneError, match=said):
+            solve(parameters=values(solver, **change))
 
 
 def test_limits_that_are_parameters_bound_the_controls(solver):
