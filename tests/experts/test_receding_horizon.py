@@ -379,7 +379,7 @@ def test_an_interrupted_plan_keeps_what_the_expert_was_told(spread_scene, monkey
     monkeypatch.setattr(guided, "read_preparation", lambda key: None)
     monkeypatch.setattr(guided, "find_coarsening", interrupted)
     expert = RecedingHorizonExpert(spread_scene.replace(spread={"target_position": 0.1}), 10)
-    told = expert.maneuver.parameters.nominal + [0.0, 0.0, 0.01, 0.01]
+    told = np.add(expert.maneuver.parameters.nominal, (0.0, 0.0, 0.01, 0.01))
     with pytest.raises(KeyboardInterrupt):
         expert.reset(expert.maneuver.initial_state, parameters=told)
     assert expert.plan is None
