@@ -153,7 +153,8 @@ def read_pickled(content: bytes) -> Any:
         ValueError,
         pickle.UnpicklingError,
     ) as error:
-        raise PickledError(f"damaged ({str(error).partition(chr(10))[0][:80]})") from error
+        reason = str(error).partition("\n")[0][:80] or "it ends early"
+        raise PickledError(f"damaged ({reason})") from error
 
 
 def as_array(value: Any) -> NDArray[np.float64] | None:

@@ -26,7 +26,7 @@ from agents.zoo.onnx_model import OnnxModel, OnnxModelError
 from agents.zoo.shelf import ZooError, policy_file
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
-from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene import StateLayout, list_scenes
 from dq_space_arm_env.task.step_report import n_observations
 
 
@@ -183,13 +183,19 @@ def check_fit(policy: ActingPolicy, scene: Scene) -> None:
 
 
 def scene_of(policies: Iterable[ActingPolicy]) -> str:
-    """The scene that policies were trained in, a name or file; "paper" if they differ or none is known."""
+    """The scene that policies were trained in, a name or file; "paper" if they differ or none is known.
+
+    Raises PolicyError for a file that is not there.
+    """
     scenes = set()
     for policy in policies:
         configuration = policy.metadata.get("configuration")
         settings = configuration if isinstance(configuration, Mapping) else {}
         scenes.add(str(settings.get("scene") or policy.metadata.get("scene", "paper")))
-    return scenes.pop() if len(scenes) == 1 else "paper"
+    scene = scenes.pop() if len(scenes) == 1 else "paper"
+    if scene not in list_scenes() and not Path(scene).exists():
+        raise PolicyError(f"the policy was trained in {scene}, which is not here: give scene (--scene)")
+    return scene
 
 
 def sees_goals(policy: ExportedPolicy) -> bool:

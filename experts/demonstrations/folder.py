@@ -32,7 +32,7 @@ from experts.demonstrations.settings import Settings
 from experts.demonstrations.shard import ShardResult
 from experts.demonstrations.tensors import DemonstrationsError, map_tensors
 
-SETTINGS, MANIFEST, SHARDS, LOG = "settings.json", "manifest.json", "shards", "log"
+SETTINGS, MANIFEST, SHARDS, LOG, CARD = "settings.json", "manifest.json", "shards", "log", "README.md"
 SHARD_NAME = re.compile(r"(\d{6,})-([0-9a-f]{64})\.safetensors")
 
 
@@ -69,6 +69,10 @@ class Folder:
 
         The operating system releases the locks when the process ends, however it ends.
         """
+        if (self.path / CARD).exists() and not (self.path / SETTINGS).exists():
+            raise DemonstrationsError(
+                f"{self.path} has a {CARD} of its own, which the data card would replace; choose a new folder"
+            )
         for folder in (self.path, self.path / SHARDS, self.path / LOG):
             folder.mkdir(parents=True, exist_ok=True)
         with _reserved(self.path, self.part, self._remove_leftovers):

@@ -32,13 +32,13 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.common.files import to_json, write_atomically
 from dq_space_arm_env.task.step_report import observation_entries
+from experts.demonstrations.folder import CARD
 from experts.demonstrations.reading import Demonstration, Demonstrations
 from experts.demonstrations.shard import PARAMETERS
 from experts.demonstrations.staging import staged
 from experts.demonstrations.tensors import DemonstrationsError
 
 VERSION = "v3.0"
-CARD = "README.md"
 INFO = "meta/info.json"
 FILES = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 """Path of a Parquet file in its folder."""

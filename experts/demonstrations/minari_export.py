@@ -30,6 +30,7 @@ import dq_space_arm_env
 from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.entries import ParameterEntries
+from experts.demonstrations.folder import CARD
 from experts.demonstrations.reading import Demonstration, Demonstrations
 from experts.demonstrations.shard import PARAMETERS, tip_errors
 from experts.demonstrations.staging import staged
@@ -37,7 +38,6 @@ from experts.demonstrations.tensors import DemonstrationsError
 from experts.problems.arm_problem import misses
 
 ALGORITHM = "Control-limited differential dynamic programming (box-DDP)"
-CARD = "README.md"
 """Name of the data card beside the data."""
 PIECE = 16
 """Episodes written at a time: some ten megabytes."""

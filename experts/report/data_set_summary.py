@@ -11,9 +11,10 @@ from experts.demonstrations import Demonstrations
 from experts.demonstrations import facts as tables
 from experts.demonstrations.data_card import data_card
 from experts.demonstrations.facts import Facts, gather
+from experts.demonstrations.folder import CARD
 from experts.demonstrations.shard import REPLAY_TOLERANCE
 
-SUMMARY, CARD = "summary", "README.md"
+SUMMARY = "summary"
 SAMPLES = 5
 """Demonstrations shown, from the cheapest to the most expensive."""
 

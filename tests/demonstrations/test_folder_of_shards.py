@@ -43,6 +43,16 @@ def test_folders_and_settings_are_created_once(quick_scene: Scene, tmp_path: Pat
         pass
 
 
+def test_a_readme_of_somebody_else_is_not_replaced(quick_scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("mine")
+    with (
+        pytest.raises(DemonstrationsError, match=r"has a README\.md of its own, .*; choose a new folder"),
+        folder_of(quick_scene, tmp_path).opened(),
+    ):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+
+
 def test_sound_shards_are_those_that_their_names_say(quick_scene: Scene, tmp_path: Path) -> None:
     folder = folder_of(quick_scene, tmp_path)
     with folder.opened():

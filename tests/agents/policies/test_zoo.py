@@ -1,6 +1,7 @@
 """The zoo: whether what it has is whole, flies, and does as its cards say; and how it takes new policies."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from agents.evaluation import evaluate, evaluation_seeds, fly
 from agents.evaluation.conditions import physics_hash
 from agents.policies import ExportedPolicy
 from agents.zoo import ZooError, list_policies, load_policy
-from agents.zoo.finding import PolicyError, as_policy, check_fit
+from agents.zoo.finding import PolicyError, as_policy, check_fit, scene_of
 from agents.zoo.shelf import MOST_BYTES, SHELF, file_hash, load_record, policy_file
 from dq_space_arm_env import SceneError, load_scene
 from experts.demonstrations import SerialExecutor
@@ -36,6 +37,12 @@ def test_a_path_is_told_from_a_name(tmp_path):
 
 def test_policies_are_shown_in_a_line():
     assert repr(load_policy("ppo")) == "<ExportedPolicy 24 -> 128 -> 128 -> 12, tanh, trained in 'paper'>"
+
+
+def test_a_policy_whose_scene_is_elsewhere_names_it():
+    policy = replace(load_policy("ppo"), metadata={"scene": "own/my.yaml"})
+    with pytest.raises(PolicyError, match=r"was trained in own/my\.yaml, which is not here: give scene"):
+        scene_of([as_policy(policy)])
 
 
 @pytest.mark.parametrize("name", list_policies())
