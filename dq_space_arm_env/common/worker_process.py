@@ -107,7 +107,7 @@ def serve(parent: int) -> None:
     tasks = sys.stdin.buffer
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # prints must not mix with answers
-    with answers:
+    with contextlib.suppress(BrokenPipeError), answers:  # a parent that was killed takes no answers
         while True:
             try:
                 function, arguments = pickle.load(tasks)

@@ -1,6 +1,7 @@
 """A worker whose parent has been killed ends by itself, though its standard input stays open."""
 
 import os
+import pickle
 import subprocess
 import sys
 
@@ -20,3 +21,11 @@ def test_an_orphan_ends() -> None:
     finally:
         worker.kill()
         worker.communicate()
+
+
+def test_an_answer_that_nobody_takes_leaves_no_traceback() -> None:
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    worker = subprocess.Popen([sys.executable, "-c", BEGIN, str(os.getpid()), *sys.path], **pipes)
+    worker.stdout.close()
+    _, errors = worker.communicate(pickle.dumps((abs, (-1,))), timeout=30.0)
+    assert (worker.returncode, errors) == (0, b"")
