@@ -1,8 +1,8 @@
 """Models of Stable-Baselines3 (.zip), read by their tensors: the file may hold code, and none of it is run.
 
 A model's file holds its attributes as JSON, those that JSON cannot hold as pickles in text, and its tensors
-in files of PyTorch. Pickles execute what they contain. The actor of every built-in policy follows from the
-tensors and the JSON, which names classes, spaces and options beside the pickles.
+in files of PyTorch. Pickles execute what they contain: only arrays are read from them, by `read_pickled`. The
+actor of every built-in policy follows from these, the tensors, and the names of classes in the JSON.
 """
 
 from __future__ import annotations

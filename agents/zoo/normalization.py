@@ -159,15 +159,18 @@ def _check_wrapper(env: gymnasium.Wrapper[Any, Any, Any, Any] | VectorWrapper) -
 
 def _check_elsewhere(env: Any) -> None:
     """Refuse wrappers in other processes, of which no more is known than that they are there."""
-    if getattr(env, "closed", False):
-        raise StatisticsError(
-            "the model's environments in other processes are closed, so that their wrappers cannot be seen: "
-            "evaluate and export it before"
-        )
-    kinds = gymnasium.ObservationWrapper, gymnasium.ActionWrapper
-    is_wrapped = getattr(env, "env_is_wrapped", lambda kind: [False])
-    spec = getattr(env, "spec", None)  # of an environment that `make_vec` has made
-    if any(any(is_wrapped(kind)) for kind in kinds) or (spec is not None and spec.kwargs.get("wrappers")):
+    if hasattr(env, "env_is_wrapped"):  # of Stable-Baselines3, which asks the processes
+        if getattr(env, "closed", False):
+            raise StatisticsError(
+                "the model's environments in other processes are closed, so that their wrappers cannot be "
+                "seen: evaluate and export it before"
+            )
+        kinds = gymnasium.ObservationWrapper, gymnasium.ActionWrapper
+        is_wrapped = any(any(env.env_is_wrapped(kind)) for kind in kinds)
+    else:  # of Gymnasium, whose `make_vec` notes what it wraps with
+        spec = getattr(env, "spec", None)
+        is_wrapped = spec is not None and bool(spec.kwargs.get("wrappers"))
+    if is_wrapped:
         raise StatisticsError(
             "the model's observations or actions pass wrappers in other processes, which only its "
             "environment applies: wrap in this process, or train in agents.SB3VecEnv with vector wrappers"
