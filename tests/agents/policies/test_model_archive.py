@@ -36,11 +36,11 @@ class OwnPolicy(ActorCriticPolicy):
 class Bomb:
     """Unpickling this creates a file."""
 
-    def __init__(self, path):
-        self.path = path
+    def __init__(self, path, state=None):
+        self.path, self.state = path, state
 
     def __reduce__(self):
-        return open, (str(self.path), "w")
+        return open, (str(self.path), "w"), self.state
 
 
 def learner(kind, scene, policy="MlpPolicy", **options):
@@ -59,8 +59,12 @@ def rewritten(source, target, change):
 
 
 def armed(source, target, path):
-    """A model with bombs in place of all that is pickled in it."""
-    bomb = base64.b64encode(pickle.dumps(Bomb(path))).decode()
+    """A model with bombs in place of all that is pickled in it; those of spaces have their bounds."""
+
+    def bomb(content):
+        pickled = pickle.loads(base64.b64decode(content))
+        bounds = {name: getattr(pickled, name) for name in ("low", "high") if hasattr(pickled, name)}
+        return base64.b64encode(pickle.dumps(Bomb(path, bounds or None))).decode()
 
     def change(name, content):
         if name != "data":
@@ -68,7 +72,7 @@ def armed(source, target, path):
         data = json.loads(content)
         for value in data.values():
             if isinstance(value, dict) and ":serialized:" in value:
-                value[":serialized:"] = bomb
+                value[":serialized:"] = bomb(value[":serialized:"])
         return json.dumps(data).encode()
 
     return rewritten(source, target, change)
