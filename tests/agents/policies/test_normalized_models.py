@@ -79,7 +79,7 @@ def test_wrappers_of_single_environments_that_a_model_does_not_note_are_refused(
     as_policy(model_in(wrappers.FlattenObservation))
 
 
-@pytest.mark.parametrize("mode", ["sync", "async", "subprocesses"])
+@pytest.mark.parametrize("mode", ["sync", "async", pytest.param("subprocesses", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wrapper", [wrappers.NormalizeObservation, None])
 def test_wrappers_of_single_environments_are_seen_in_many(mode, wrapper, small_scene):
     single = [] if wrapper is None else [wrapper]
