@@ -48,6 +48,7 @@ from experts.problems.shooting_problem import (
     FloatArray,
     check_array,
     check_control_weights,
+    check_state,
     native_calls,
     stage_bounds,
 )
@@ -129,6 +130,7 @@ class MultipleShooting:
                 f"x_init[{k}] is no state: its entry {i}, {given[k, i]}, is more than {LARGEST_PROJECTION} "
                 "off the valid ones; a pose must be a unit dual quaternion"
             )
+        check_state(problem, "x_init", states)  # zeros stay zeros
         return states
 
     def close_gaps(

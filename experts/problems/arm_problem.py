@@ -267,18 +267,21 @@ class ArmProblem:
         return carried_along(self.kernels.layout, states, parameters, self.parameters.rows)
 
     def check_state(self, name: str, state: FloatArray) -> None:
-        """Raise ValueError if poses and rotations of a state, shape (n_x,), are far from unit ones."""
-        layout = self.kernels.layout
-        pose = state[layout.state.pose]
-        real, dual = np.split(pose, 2)
-        units = [real, *(state[where] for where in unit_quaternions(self.scene))]
-        overlap = 0.0 if layout.planar else float(real @ dual) / (1.0 + float(np.linalg.norm(dual)))
-        lengths = [float(np.linalg.norm(unit)) for unit in units]
-        if max(abs(overlap), *(abs(length - 1.0) for length in lengths)) > NO_STATE:
-            found = ", ".join(f"{length:.4g}" for length in lengths)
+        """Raise ValueError if poses and rotations are far from unit ones, in (n_x,) or in rows (M, n_x)."""
+        layout, rows = self.kernels.layout, np.atleast_2d(state)
+        real, dual = np.split(rows[:, layout.state.pose], 2, axis=1)
+        units = [real, *(rows[:, where] for where in unit_quaternions(self.scene))]
+        lengths = np.array([np.linalg.norm(unit, axis=1) for unit in units])
+        products = np.zeros(len(rows)) if layout.planar else (real * dual).sum(axis=1)
+        overlaps = np.abs(products) / (1.0 + np.linalg.norm(dual, axis=1))
+        off = np.maximum(overlaps, np.abs(lengths - 1.0).max(axis=0)) > NO_STATE
+        if off.any():
+            k = int(off.argmax())
+            where = name if state.ndim == 1 else f"{name}[{k}]"
+            found = ", ".join(f"{length:.4g}" for length in lengths[:, k])
             raise ValueError(
-                f"{name} is no state: its rotations have the lengths {found}, and q_r . q_d of its pose is "
-                f"{float(real @ dual):.3g}; a pose must be a unit dual quaternion"
+                f"{where} is no state: its rotations have the lengths {found}, and q_r . q_d of its pose is "
+                f"{products[k]:.3g}; a pose must be a unit dual quaternion"
             )
 
     def misses(self, state: FloatArray) -> float:

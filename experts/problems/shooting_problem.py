@@ -38,7 +38,7 @@ A problem may have these attributes besides those of `ShootingProblem`:
 | `constraints`, a `StageConstraints` or None; kernels read `parameters.more` | nothing constrains it |
 | `rate_limits`, see `RateLimits` | controls may jump |
 | `is_success(states, controls)`, whether a trajectory fulfills its task | whatever converges does |
-| `check_state(name, x)`, which raises ValueError for numbers that are no state | all are states |
+| `check_state(name, x)`, raises ValueError where (n_x,) or a row of (M, n_x) is no state | all are states |
 | `native_calls()`, see `native_calls` | kernels raise nothing |
 | `compiling_aside(kernels, before)`, see `compiling_aside` | kernels compile when they are asked for |
 """
@@ -333,7 +333,7 @@ def check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
 
 
 def check_state(problem: ShootingProblem, name: str, state: FloatArray) -> None:
-    """Refuse a state, (n_x,), that is none: rotations without unit quaternions, where the problem has any."""
+    """Refuse what is no state, (n_x,) or a row of (M, n_x): rotations that are no unit quaternions."""
     check: Callable[[str, FloatArray], None] | None = getattr(problem, "check_state", None)
     if check is not None:
         check(name, state)

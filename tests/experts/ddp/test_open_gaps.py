@@ -191,9 +191,10 @@ def test_bad_guesses_of_the_states_are_refused(unicycle, change, message):
 def test_poses_off_the_manifold_are_refused():
     problem = ArmProblem("no-wrist")
     states = np.tile(problem.initial_state, (problem.horizon + 1, 1))
-    states[5, :4] *= 1.01
-    with pytest.raises(ValueError, match=r"x_init\[5\] is no state: .* must be a unit dual quaternion"):
-        BoxDDP(problem).solve(x_init=states)
+    for factor in (0.0, 1.01):
+        states[5, :8] = factor * states[4, :8]
+        with pytest.raises(ValueError, match=r"x_init\[5\] is no state: .* must be a unit dual quaternion"):
+            BoxDDP(problem).solve(x_init=states)
     with pytest.raises(ValueError, match=r"^x0 is no state: .* must be a unit dual quaternion"):
         BoxDDP(problem).solve(states[5])
 
