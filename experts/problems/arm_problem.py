@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -82,6 +82,14 @@ class ArmProblem:
         self._limits_vary = not set(layout.control.limits).isdisjoint(layout.parameters.names)
         self._end_weight, self.reserve = 1.0, 0.0
         self._make_inputs()
+
+    def __copy__(self) -> "ArmProblem":
+        twin = object.__new__(type(self))
+        twin.__dict__.update(self.__dict__)
+        return twin
+
+    def __reduce__(self) -> NoReturn:
+        self.parameters.__reduce__()
 
     def constrained(self, reserve: float = 0.0) -> "ArmProblem":
         """Return the same maneuver with success as constraint, for a scene that has no constraints.

@@ -491,6 +491,7 @@ def test_solvers_share_their_work_arrays_with_nobody(pendulum, solver, duplicate
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, pickle.dumps])
 def test_problems_share_with_nobody_what_their_kernels_read(duplicate):
     problem = ArmProblem("paper")
+    problem.kernel("difference")
     assert copy.copy(problem).parameters is problem.parameters
     with pytest.raises(TypeError, match=r"cannot be copied or pickled, .* make another problem of the same"):
         duplicate(problem)
