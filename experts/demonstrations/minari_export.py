@@ -38,7 +38,6 @@ from experts.demonstrations.tensors import DemonstrationsError
 from experts.problems.arm_problem import misses
 
 ALGORITHM = "Control-limited differential dynamic programming (box-DDP)"
-"""Name of the data card beside the data."""
 PIECE = 16
 """Episodes written at a time: some ten megabytes."""
 PADDING, MARGIN = 1.3, 2**25

@@ -84,6 +84,7 @@ class ArmProblem:
         self._make_inputs()
 
     def __copy__(self) -> "ArmProblem":
+        """Share all, parameters too, until `_make_inputs`; `__reduce__` is for deep copies and pickles."""
         twin = object.__new__(type(self))
         twin.__dict__.update(self.__dict__)
         return twin

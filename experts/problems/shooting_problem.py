@@ -124,7 +124,7 @@ class StageParameters:
                 "with a row for each stage"
             )
         check_array("parameters", given, given.shape)
-        if self._check is not None and parameters is not None and given.ndim == 1:
+        if self._check is not None and parameters is not None and given.ndim == 1 and given.size:
             self._check(given)
         if self._in_stages is not None and given.ndim == 1:
             return self._in_stages(given)
