@@ -66,7 +66,6 @@ def train(
 
 def is_trained(configuration: AgentConfiguration, folder: Path) -> bool:
     """Whether a folder holds the policy with which the training of a configuration ends."""
-    from agents.policies import PolicyFileError
     from agents.policies.chunking import load_exported
     from agents.run_folder import POLICY
 
@@ -74,7 +73,7 @@ def is_trained(configuration: AgentConfiguration, folder: Path) -> bool:
         kept = load_exported(folder / POLICY).metadata
         there = load_configuration(kept["configuration"]).resolved()
         scene_hash = load_scene(configuration.scene).content_hash()
-    except (PolicyFileError, KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError):
         return False
     same = there.model_copy(update={"description": configuration.description})
     return same == configuration.resolved() and kept.get("scene_hash") == scene_hash

@@ -52,16 +52,12 @@ def load_policy(
     normalize: Path | None = None,
 ) -> Pilot:
     """Load a trained policy."""
-    from agents.policies import PolicyFileError
     from agents.zoo.finding import as_policy, check_fit
     from dq_space_arm_env.command_line.simulated_episode import Pilot
 
     path = Path(policy) if Path(policy).exists() else policy_files()[policy]
-    try:
-        label = path.stem if path.is_file() else path.name
-        acting = as_policy(path, label, trust=trust, normalize=normalize)
-    except PolicyFileError as error:
-        raise ValueError(str(error)) from error
+    label = path.stem if path.is_file() else path.name
+    acting = as_policy(path, label, trust=trust, normalize=normalize)
     check_fit(acting, start.scene)
     return Pilot(acting.label, acting.act)
 

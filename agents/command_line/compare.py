@@ -47,7 +47,7 @@ def compare() -> None:
 
     Controllers fly the expert's plans: open loop, with its feedback gains, or replanned at every step. All
     fly from the fixed evaluation starts and are compared with the optimal costs there. Re-run the command to
-    resume. Exit status 1: the expert had to stop, or the file of a policy is damaged.
+    resume. Exit status 1: the expert had to stop.
     """
 
 
@@ -216,7 +216,7 @@ def residual(
 
     All fly from the same evaluation starts and meet the same pushes and noise. The output folder receives
     table.md, comparison.json, the plans, the rows with each episode, and comparison.png. Re-run the command
-    to resume. Exit status 1: the expert had to stop, or the file of a policy is damaged.
+    to resume. Exit status 1: the expert had to stop.
     """
     executor = chosen_executor(workers, ray)
     from agents.residual.mismatch_comparison import compare_corrections

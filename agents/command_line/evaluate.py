@@ -80,8 +80,7 @@ def evaluate() -> None:
 
     A policy is a file (.npz, .onnx, .zip), the folder of a training run, or a name of the zoo. The first use
     computes the expert's costs, in minutes, and caches them. Three or more policies that differ only in their
-    training seeds are also aggregated. Exit status 1: the expert had to stop, or the file of a policy is
-    damaged.
+    training seeds are also aggregated. Exit status 1: the expert had to stop.
     """
 
 
@@ -196,7 +195,7 @@ def show(
     """Show POLICY flying the maneuver, beside the expert's solution from the same start.
 
     The output folder receives flight.json, and pictures of tip errors and inputs over time. Exit status 1:
-    the agent misses the target in one of the flights, or its file is damaged.
+    the agent misses the target in one of the flights.
     """
     chosen = policy or other
     if chosen is None or None not in (policy, other):

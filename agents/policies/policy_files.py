@@ -22,7 +22,7 @@ FORMAT = 1  # version of the files
 MOST_BYTES = 256 * 2**20  # 33 million weights; twice as many as configurations allow between layers
 
 
-class PolicyFileError(Exception):
+class PolicyFileError(ValueError):
     """A file is not a policy that this version can read."""
 
 

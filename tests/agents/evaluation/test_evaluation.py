@@ -542,8 +542,10 @@ def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
     (tmp_path / "config.yaml").write_text("name: begun\n")
     assert main(["evaluate", str(tmp_path), "--no-expert"]) == 2
     assert f"{tmp_path}: this training has no policy yet; run its command again" in capsys.readouterr().err
-    (tmp_path / "damaged.npz").write_bytes(b"nothing")
-    assert main(["evaluate", "--policy", str(tmp_path / "damaged.npz"), "--no-expert"]) == 1
-    assert "cannot be read as a policy" in capsys.readouterr().err
+    messages = {"damaged.npz": "cannot be read as a policy", "damaged.zip": "is not a model"}
+    for name, message in messages.items():
+        (tmp_path / name).write_bytes(b"nothing")
+        assert main(["evaluate", "--policy", str(tmp_path / name), "--no-expert"]) == 2
+        assert f"{name} {message}" in capsys.readouterr().err
     assert main(["evaluate", "--policy", "nobody", "--no-expert"]) == 2
     assert "the zoo has no policy 'nobody'" in capsys.readouterr().err
