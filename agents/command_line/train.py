@@ -32,7 +32,7 @@ if TYPE_CHECKING:
           dq-space-arm train ppo                                  # a configuration that ships
           dq-space-arm train my.yaml --seed 1 --out results/mine  # your own
           dq-space-arm train apg --scene my-scene.yaml            # in a scene of your own
-          dq-space-arm train sac --minutes 30                     # stop after half an hour; repeat to resume
+          dq-space-arm train sac --minutes 30                     # half an hour; with more, it goes on
           dq-space-arm train apg ppo --seeds 10                   # twenty runs, on all cores, one table
           dq-space-arm train apg ppo --seeds 10 --ray             # the machines of a Ray cluster
     """,

@@ -95,7 +95,7 @@ def measure(
             done.append(_train(configuration, effort, variant, chosen, seed, tests, tell))
             lines = "".join(json.dumps(line) + "\n" for line in (identity, *done))
             write_atomically(folder / LINES, lines)
-    return done
+    return [row for row in done if (row["variant"], row["count"], row["seed"]) in order]
 
 
 def _order(effort: Effort) -> Iterator[tuple[str, int, int]]:

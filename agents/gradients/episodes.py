@@ -32,6 +32,7 @@ from agents.gradients.episode_loops import (
 from agents.gradients.layers import Layers
 from agents.gradients.penalties import Penalties
 from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env.environment.disturbances import displaced
 from dq_space_arm_env.kernels.bound import KernelCall, address_of
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene import StateLayout
@@ -308,7 +309,7 @@ class Episodes:
             struck = jumps[k].any(axis=1)
             self._states[k][struck] = self._kernels.retract(self._states[k][struck], jumps[k][struck])
         if noise is not None:
-            self._measured[k] = self._kernels.retract(self._states[k], noise[k])
+            self._measured[k] = displaced(self._kernels, self._states[k], noise[k])
         elif self._measured is not self._states:
             self._measured[k] = self._states[k]
 

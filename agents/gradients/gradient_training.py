@@ -109,8 +109,8 @@ class _Learner:
         start = load_start(configuration.start_from, configuration.network, sizes[0], sizes[-1])
         self._begin_with(start, units)
         self._episodes = self._begin_episodes(units)
-        becomes_finer = self._episodes.penalties.is_constrained and len(self._times) <= scene.simulation.steps
-        self._every_step_from = math.ceil(EVERY_STEP * settings.updates) if becomes_finer else math.inf
+        constrained = self._episodes.penalties.is_constrained
+        self._every_step_from = math.ceil(EVERY_STEP * settings.updates) if constrained else math.inf
         self._optimizer = SOAP(self._weights)
         self._updates, self._seconds = 0, 0.0
         self._end_weight = settings.end_weight
@@ -130,6 +130,8 @@ class _Learner:
 
     def _decide_at_every_step(self) -> None:
         """Go on as in flight: what violates a constraint for a moment may do so between decisions."""
+        if len(self._times) > self._scene.simulation.steps:
+            return  # they do already
         before = self._episodes
         self._times = every_step(self._scene)
         self._episodes = self._begin_episodes(before.units)

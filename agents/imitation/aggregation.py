@@ -101,6 +101,12 @@ def aggregate(
     starts = demonstrations if starts is None else starts
     check_labels(settings, starts)
     chosen = settings.model_dump(mode="json", exclude={"cloning"})
+    given = {
+        "dagger": settings.model_dump(mode="json"),
+        "starts": [starts.manifest["settings_sha256"], fingerprint(starts)],
+        "seed": making.seed,
+        "threads": making.threads,
+    }
     facts = {**cloned.facts, "aggregation": {**chosen, "starts": fingerprint(starts)}}
     network = copy.deepcopy(cloned.network)
     statistics = Statistics.of(demonstrations)
@@ -111,7 +117,7 @@ def aggregate(
     history = list(cloned.history)
     for number in range(settings.rounds):
         place = None if folder is None else Path(folder) / f"round-{number:02d}"
-        identity = {"training": facts["training"], "aggregation": facts["aggregation"], "round": number}
+        identity = {"training": facts["training"], **given, "round": number}
         done, found = _corrections(place, identity, partial(expert.correct, network, number))
         corrections.append(found)
         rounds.append(done._replace(corrections=sum(len(part) for part in corrections)))

@@ -172,6 +172,7 @@ class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any
         self._uncorrected = state["uncorrected"].copy()
         self._observer.reset(self._plans.known[: self.num_envs])
         self._observer.average = state["average"].copy()
+        self._seed = None  # the worlds' generators are those of the state
 
     def _observe(self) -> NDArray[np.float32]:
         """Disturb flights and twins alike, and compute the plans' actions."""

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from pydantic import Field, StrictStr, ValidationError
 
 from agents.configuration import AgentConfiguration, load_configuration
+from agents.configuration.residual import ResidualConfiguration
 from agents.configuration.schema import Few, name_in
 from agents.evaluation.conditions import CONDITIONS
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
@@ -105,13 +106,21 @@ class Suite(Model):
         return scene
 
     def training(self, agent: str | Path, task: str) -> AgentConfiguration:
-        """Configuration of an agent for a task: one of the suite's, a shipped one, or a YAML file's."""
+        """Configuration of an agent for a task: one of the suite's, a shipped one, or a YAML file's.
+
+        SuiteError if it cannot fly alone.
+        """
         if agent in self.agents:
             content, name = dict(self.agents[str(agent)]), str(agent)
         else:
             given = load_configuration(agent)
             content, name = given.model_dump(exclude_none=True, exclude={"description"}), given.name
-        return load_configuration({**content, "name": name_in(name, task), "scene": task})
+        configuration = load_configuration({**content, "name": name_in(name, task), "scene": task})
+        if isinstance(configuration, ResidualConfiguration):
+            raise SuiteError(
+                f"{agent} corrects plans and cannot fly alone: use `dq-space-arm compare residual`"
+            )
+        return configuration
 
 
 def list_suites() -> list[str]:

@@ -61,6 +61,10 @@ def test_it_measures_draws_and_goes_on(arguments, tmp_path, capsys):
     assert again[:5] == whole[:5]
     for one, other in zip(again[5:], whole[5:], strict=True):
         assert {**json.loads(one), "seconds": 0} == {**json.loads(other), "seconds": 0}
+    # Asked for less, it tells of that alone, and keeps the rest.
+    assert main(["compare", "cloning", *command[:-1], "--no-picture"]) == 0
+    assert {each["count"] for each in json.loads((tmp_path / "cloning.json").read_text())["points"]} == {8}
+    assert (tmp_path / LINES).read_text().splitlines() == again
 
 
 @pytest.mark.slow

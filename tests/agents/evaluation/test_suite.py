@@ -127,6 +127,8 @@ def test_unknown_names_are_refused(content):
         run_suite(["zoo=mine.npz"], suite)
     with pytest.raises(PolicyError, match="apg maps 24 observations to 12 inputs"):
         run_suite(["tiny"], suite, policies={"apg": lambda scene: load_policy("apg")})  # and trains nothing
+    with pytest.raises(SuiteError, match="residual corrects plans and cannot fly alone"):
+        run_suite(["residual"], suite)  # and trains nothing
     with pytest.raises(ConfigurationError, match=r"algorithm\.name"):
         Suite.model_validate({**content, "agents": {"tiny": {}}}).training(
             "tiny", next(iter(content["tasks"]))

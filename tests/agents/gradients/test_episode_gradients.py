@@ -19,6 +19,7 @@ from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, compile_scene, 
 from dq_space_arm_env.environment.disturbances import Disturbance
 from dq_space_arm_env.environment.rollouts import rollout
 from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
+from dq_space_arm_env.scene.start import unit_quaternions
 
 pytestmark = pytest.mark.agents
 
@@ -447,6 +448,18 @@ def test_noise_is_that_of_means_over_decisions(small_scene):
     costs = flown.costs()
     np.testing.assert_array_equal(costs[: COUNT // 2], exact.costs()[: COUNT // 2])
     assert (costs[COUNT // 2 :] != exact.costs()[COUNT // 2 :]).all()
+
+
+@pytest.mark.slow
+def test_noise_leaves_quaternions_of_spherical_joints_rotations():
+    scene = load_scene("heavy-wrist")
+    (where,) = unit_quaternions(scene)
+    flown = Flown(scene, 200, outputs=0.0, noisy=True)
+    flown.meet(MISMATCH.model_copy(update={"push": 0.0, "noise": 0.02}))
+    flown.costs()
+    measured, states = (each[:-1, :, where] for each in (flown.episodes._measured, flown.episodes._states))
+    assert np.abs(measured - states).max() > 0.01
+    np.testing.assert_allclose(np.linalg.norm(measured, axis=-1), 1.0, rtol=0, atol=1e-9)
 
 
 def test_substeps_are_those_of_the_integrator(small_scene):

@@ -81,6 +81,18 @@ def test_constrained_episodes_decide_at_every_time_step_at_last(limited, small_f
     assert known.isdisjoint(row.tobytes() for row in learner._starts.states)
 
 
+def test_starts_are_new_at_last_where_episodes_decide_at_every_time_step_throughout(limited, small_file):
+    steps = limited.simulation.steps
+    learner = gradient_training._Learner(settings(small_file, updates=20, decisions=steps, copies=4), limited)
+    drawn = []
+    for _ in range(20):
+        learner._update()
+        drawn.append(learner._starts.states.tobytes())
+    assert len(set(drawn[:18])) == 1
+    assert len(set(drawn)) == 3
+    assert learner.effort()["environment_steps"] == 4 * 20 * steps
+
+
 def settings(small_file, **algorithm):
     changes = {"updates": 120, "copies": 16, "decisions": 40, "starts": 256, **algorithm}
     return load_configuration(

@@ -1,12 +1,14 @@
 """DAgger: what the expert says about visited states, and a network that learns from it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
 from agents.configuration import Network  # noqa: E402
-from agents.configuration.imitation import Cloning, Dagger  # noqa: E402
+from agents.configuration.imitation import Cloning, Dagger, ObjectiveWeights  # noqa: E402
 from agents.imitation import Making, aggregate, clone  # noqa: E402
 from agents.imitation.aggregation import CORRECTIONS  # noqa: E402
 from agents.imitation.labels import Solver, label_by_gains  # noqa: E402
@@ -213,8 +215,15 @@ def test_an_interrupted_run_ends_with_the_same_weights(demonstrations, cloned, t
     assert whole.rounds[1].corrections > whole.rounds[0].corrections
     assert whole.export().metadata["aggregation"]["labels"] == labels
 
-    with pytest.raises(CheckpointError, match="another run"):
-        aggregate(cloned, demonstrations, dagger(61, labels=labels), tmp_path, making=MAKING)
+    unlike = CLONING.model_copy(update={"objective": ObjectiveWeights(gain_weight=0.7)})
+    others = [
+        (dagger(61, labels=labels), MAKING),
+        (settings, replace(MAKING, seed=1)),
+        (dagger(labels=labels, cloning=unlike), MAKING),
+    ]
+    for other, making in others:
+        with pytest.raises(CheckpointError, match="another run"):
+            aggregate(cloned, demonstrations, other, tmp_path, making=making)
 
 
 def test_a_round_has_no_more_flights_than_starts(demonstrations, cloned):

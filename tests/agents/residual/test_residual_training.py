@@ -162,6 +162,30 @@ def test_what_follows_a_divergence_depends_on_the_seed_alone(configuration, smal
         np.testing.assert_array_equal(seen(asked), seen(asked))
 
 
+def test_a_divergence_after_resuming_is_followed_as_without(configuration, small_scene, demonstrations):
+    whole, resumed = (
+        make_residual_environment(configuration(), small_scene, demonstrations) for _ in range(2)
+    )
+    whole.reset()
+    idle, steps = np.zeros((COPIES, *whole.action_space.shape)), small_scene.simulation.steps // REPEAT
+
+    def lose_one(environment):
+        worlds = environment.vector_env.unwrapped._worlds
+        push = np.zeros((2 * COPIES, worlds.kernels.n_t))
+        push[0, worlds.kernels.layout.tangent.base_velocity] = 1e9
+        worlds.perturb(push)
+
+    lose_one(whole)
+    whole.step(idle)
+    resumed.vector_env.unwrapped.set_state(whole.vector_env.unwrapped.get_state())
+    for stage in range(1, steps + 2):
+        if stage == steps:
+            lose_one(whole)
+            lose_one(resumed)
+        seen, expected = (each.step(idle)[0] for each in (resumed, whole))
+        np.testing.assert_array_equal(seen, expected)
+
+
 @pytest.mark.parametrize("name", ["demonstrations", "drawn"])
 def test_the_environment_and_the_controller_see_and_do_the_same(name, configuration, request):
     """A policy that corrects by what it sees costs the same in both, also where targets are drawn."""
