@@ -5,6 +5,7 @@ At a release velocities stay, and the payload leaves with the tip's.
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from dq_space_arm_env.kernels.kernels import Kernels
 from dq_space_arm_env.scene.pose import PLANAR_TWIST
 
 Array = NDArray[Any]
+
+_PARTS = ("base", "links", "wrist", "tip", "tip_body", "other_tips", "actuators.wheels", "actuators.tank")
 
 
 def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: ArrayLike) -> Array:
@@ -43,8 +46,7 @@ def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: A
     payload = loaded.scene.payload
     if payload is None:
         raise ValueError(f"loaded: scene {loaded.scene.name!r} has no payload to be caught")
-    names = ("base", "links", "wrist", "tip")
-    differing = [name for name in names if getattr(free.scene, name) != getattr(loaded.scene, name)]
+    differing = [name for name in _PARTS if attrgetter(name)(free.scene) != attrgetter(name)(loaded.scene)]
     if free.scene.payload is not None or differing:
         which = ", ".join(differing) or "it has a payload already"
         raise ValueError(

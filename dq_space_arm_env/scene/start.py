@@ -35,6 +35,7 @@ from dq_space_arm_env.scene.parameters import (
     wheel_names,
 )
 from dq_space_arm_env.scene.path import first_velocity
+from dq_space_arm_env.scene.phases import phase_scene
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST, Pose
 from dq_space_arm_env.scene.schema import Scene
 
@@ -265,7 +266,20 @@ def episode_scene(scene: Scene, values: Sequence[float]) -> Scene:
             "angular_velocity": twist[:3],
             "linear_velocity": linear,
         }
+    if "target.pose" in changes:
+        changes["phases"] = list(_resting_where_they_did(scene))
     return scene.replace(changes)
+
+
+def _resting_where_they_did(scene: Scene) -> Iterator[dict[str, Any]]:
+    """The phases; those whose target rests give its whole pose, which the scene's own would complete."""
+    for phase in scene.phases:
+        own, given = phase_scene(scene, phase)[0].target, phase.model_dump()
+        if scene.target.motion is not None and own.motion is None:
+            pose = {f"target.pose.{name}": value for name, value in own.pose.model_dump().items()}
+            others = {name: value for name, value in phase.changes if not is_part(name, "target.pose")}
+            given["changes"] = others | pose
+        yield given
 
 
 def _indexed_target(scene: Scene) -> Iterator[tuple[Number, int]]:

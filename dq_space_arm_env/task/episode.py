@@ -126,7 +126,9 @@ def step(
     target = next_target(before, body_pose(scene, equations.given), following)
     rest, caught = target, []
     if has_catch(scene):
-        x_next, *caught = _catch(with_target(before, target), x_next, taken + 1.0, memory[-1])
+        # The way of waypoints goes on where a phase has the target at rest.
+        there = _resting(scene, taken, target) if isinstance(scene.target.motion, Waypoints) else target
+        x_next, *caught = _catch(with_target(before, there), x_next, taken + 1.0, memory[-1])
         rest = [*target, caught[0]]
     rest = _resting(scene, taken + 1.0, rest)
     after = at_stage(equations, taken + 1.0, rest)

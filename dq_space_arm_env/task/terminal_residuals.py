@@ -69,7 +69,7 @@ def _success_residuals(scene: Scene, error: Scalars, twist: Scalars) -> list[Sca
     squares = {name: dot(vector, vector) for name, vector in zip(names, vectors, strict=True)}
     found = []
     for name, _, tolerance in success_tolerances(scene):
-        bound = 2.0 * math.sin(0.5 * tolerance) if name == names[0] else tolerance
+        bound = 2.0 * math.sin(0.5 * min(tolerance, math.pi)) if name == names[0] else tolerance
         found.append(0.5 * (squares[name] / bound - bound))
     return found
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.constraint_rows import pairs_that_may_touch, rows_of
@@ -156,7 +155,9 @@ def _largest(actuator: Any, given: FloatArray) -> float:
     return float(max(limits, default=max(float(np.abs(given).max(initial=0.0)), 1.0)))
 
 
-def violations(scene: Scene, states: FloatArray, controls: FloatArray, body: FloatArray) -> NDArray[np.bool_]:
+def violations(
+    scene: Scene, states: FloatArray, controls: FloatArray, body: FloatArray, target: FloatArray
+) -> NDArray[np.bool_]:
     """Find where the rows of a scene's constraints are violated.
 
     Args:
@@ -164,20 +165,19 @@ def violations(scene: Scene, states: FloatArray, controls: FloatArray, body: Flo
         states: Shape (M + 1, n_x).
         controls: Shape (M, n_u), N, N m, rad/s; none acts in the last state.
         body: Pose of the target's body, shape (8,) or (M + 1, 8), dimensionless and m.
+        target: Pose that the tip should have, of its grasp frame, likewise.
 
     Returns:
         Whether a row is violated by more than `VISIBLE` of its tolerance, shape (rows, M + 1).
     """
     # CasADi, which these import, is needed here only.
     from dq_space_arm_env.task.constraint_residuals import path_residuals
-    from dq_space_arm_env.task.equations import SceneEquations, body_pose, grasp_pose
+    from dq_space_arm_env.task.equations import SceneEquations
 
     equations = SceneEquations.of(scene, _numbers_during(scene, len(states)))
-    entries = np.moveaxis(np.broadcast_to(body, (len(states), 8)), 1, 0)
+    entries, grasp = (np.moveaxis(np.broadcast_to(each, (len(states), 8)), 1, 0) for each in (body, target))
     places = {n.name: entries[i] for n, i in zip(target_numbers(scene), target_entries(scene), strict=True)}
-    given = {**equations.given, **places}
-    grasp = dq.multiply(body_pose(scene, given), grasp_pose(scene, given))
-    equations = replace(equations, given=given, target=grasp)
+    equations = replace(equations, given={**equations.given, **places}, target=list(grasp))
     layout, last = StateLayout.of(scene), np.zeros_like(controls[:1])
     last[0, list(layout.previous_controls)] = states[-1, layout.state.actuators]  # they change no more
     x, u = list(states.T), list(np.vstack([controls, last]).T)

@@ -176,6 +176,9 @@ def test_catching_refuses_scenes_that_differ_in_more_than_the_payload() -> None:
         catch_payload(loaded, compile_scene("paper"), loaded.layout.initial_state, np.zeros(6))
     with pytest.raises(ValueError, match=r"without its payload: wrist, tip"):
         catch_payload(compile_scene("paper"), loaded, loaded.layout.initial_state, np.zeros(6))
+    free = compile_scene(loaded.scene.replace({"payload": None, "tip_link": "link 1"}))
+    with pytest.raises(ValueError, match=r"without its payload: tip_body"):
+        catch_payload(free, loaded, loaded.layout.initial_state, np.zeros(6))
 
 
 def test_a_state_at_the_limit_of_the_environment_is_accepted() -> None:

@@ -12,7 +12,7 @@ from dq_space_arm_env import SceneError, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.library import PENALIZED
-from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows
+from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, terminal_rows
 from dq_space_arm_env.scene.constraints import Volume
 from dq_space_arm_env.task.constraint_residuals import _Segment, _segment_distance
 from dq_space_arm_env.task.equations import SceneEquations
@@ -95,6 +95,18 @@ def differences(function, size):
         first = [(4.0 * b - a) / 3.0 for a, b in itertools.pairwise(slopes)]
         columns.append((16.0 * first[1] - first[0]) / 15.0)
     return np.array(columns).T
+
+
+def test_any_attitude_is_within_a_tolerance_of_more_than_half_a_turn():
+    end = {"name": "end", "kind": "terminal", "exact": ["base_velocity"]}
+    scene = load_scene("planar").replace({"constraints": [end], "success.attitude_error_deg": 360.0})
+    kernels = compile_scene(scene)
+    row = [each.name for each in terminal_rows(scene)].index("success: attitude error")
+    states = np.tile(kernels.layout.initial_state, (50, 1))
+    states[:, kernels.layout.state.joint_angles] = np.random.default_rng(0).uniform(-9.0, 9.0, (50, 3))
+    angles, residuals = kernels.tip_errors(states)[:, 0], kernels.terminal_constraints(states)[:, row]
+    assert angles.max() > 170.0
+    assert residuals.max() < 0.0
 
 
 @pytest.mark.parametrize("scene", [every_kind, with_wheels])

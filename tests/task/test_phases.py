@@ -13,6 +13,7 @@ from dq_space_arm_env import Scene, SceneError, compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
+from dq_space_arm_env.environment.catches import catches
 from dq_space_arm_env.environment.disturbances import with_loads
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.interoperability.pinocchio_twin import pinocchio_model, to_pinocchio
@@ -113,6 +114,79 @@ def test_a_body_that_came_to_rest_is_caught_at_rest() -> None:
     kernels = compile_scene(scene)
     caught = kernels.stage_parameters()[1, kernels.parameters.indices("catch")]
     assert caught.tolist() == [1.0, *[0.0] * 6]
+
+
+SLIDING = {"kind": "screw", "linear_velocity": [1.0, 0.0, 0.0]}
+PASSING = {
+    "kind": "waypoints",
+    "points": [{"time": t, "pose": {"position": [1.5 + t, 0.0, 0.0]}} for t in (0.0, 10.0)],
+}
+
+
+@pytest.mark.parametrize("motion", [SLIDING, PASSING])
+def test_a_body_that_came_to_rest_is_caught_where_it_rests(motion: dict[str, Any]) -> None:
+    """However its way would have gone on."""
+    still: dict[str, Any] = {"target.motion": None}
+    scene = load_scene("planar").replace(
+        {
+            "payload": {"mass": 20.0, "inertia": [1.0, 1.0, 1.0]},
+            "target.motion": motion,
+            "phases": [
+                {"name": "move", "steps": 5, "changes": {"payload": None}},
+                {"name": "rest", "steps": 5, "changes": {"payload": None, **still}},
+                {
+                    "name": "hold",
+                    "steps": 5,
+                    "catch": {"position_error": 0.05, "velocity_error": 0.05},
+                    "changes": still,
+                },
+            ],
+            "simulation": {"steps": 15},
+        }
+    )
+    at_tip = poses.to_rotation_and_position(
+        compile_scene(scene).tip_pose(StateLayout.of(scene).initial_state)
+    )
+    scene = scene.replace({"target.pose": dict(zip(("rotation", "position"), at_tip, strict=True))})
+    env = dq_space_arm_env.DQSpaceArmEnv(scene)
+    env.reset(options={"nominal": True})
+    states = [env.state]
+    for _ in range(15):
+        info = env.step(np.zeros(6))[-1]
+        states.append(env.state)
+    assert info["caught"]
+    assert info["is_success"]
+    rows = env.kernels.stage_parameters()
+    (planned,) = catches(env.kernels, rows, np.array(states), np.zeros((15, 6)))
+    assert planned.is_met
+    np.testing.assert_allclose(planned.errors, 0.0, atol=1e-6)
+
+
+DRAWN = load_scene("planar").replace(
+    {
+        "target.motion": SLIDING,
+        "spread.target_position": 0.5,
+        "phases": [
+            {"name": "move", "steps": 5},
+            {"name": "rest", "steps": 5, "changes": {"target.motion": None}},
+        ],
+        "simulation": {"steps": 10},
+    }
+)
+
+
+@pytest.mark.parametrize("scene", [DRAWN, SCENES["capture-and-detumble"]])
+def test_the_scene_of_an_episode_has_its_phases(scene: Scene) -> None:
+    """A target that comes to rest rests where it does in the episode, wherever its pose was drawn."""
+    env = dq_space_arm_env.DQSpaceArmEnv(scene)
+    env.reset(seed=3)
+    twin = dq_space_arm_env.DQSpaceArmEnv(env.episode_scene)
+    twin.reset(options={"initial_state": env.state})
+    rng = np.random.default_rng(0)
+    for _ in range(env.scene.simulation.steps):
+        action = rng.uniform(-0.1, 0.1, env.kernels.n_u)
+        reward, expected = (float(each.step(action)[1]) for each in (twin, env))
+        assert reward == pytest.approx(expected, rel=1e-9)
 
 
 def test_recorded_controls_are_fractions_of_the_limits_of_their_phase() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.algebra import poses, rotations
+from dq_space_arm_env.environment.rollouts import rollout
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.viewing.constraint_shapes import (
@@ -132,14 +133,42 @@ def test_each_thruster_blows_at_its_place_as_it_fires(make_flight):
 
 def test_what_is_red_is_what_the_compiled_residuals_call_violated(constrained, make_flight):
     kernels, flight = compile_scene(constrained), make_flight(constrained)
-    found = violations(
-        constrained, flight.states, flight.controls, np.array(constrained.target.pose.dual_quaternion)
-    )
+    aim = np.array(constrained.target.pose.dual_quaternion)
+    found = violations(constrained, flight.states, flight.controls, aim, aim)
     residuals = kernels.constraints(flight.states[:-1], flight.controls)
     tolerance = [row.tolerance for row in path_rows(constrained)]
     expected = residuals > VISIBLE * np.array(tolerance)
     np.testing.assert_array_equal(found[:, :-1], expected.T)
     assert expected.any(axis=0).sum() >= 3  # of several kinds
+
+
+def test_what_is_red_belongs_to_the_grasp_of_the_flight():
+    scene = load_scene("planar").replace(
+        {
+            "target.grasp": {"position": [0.1, 0.0, 0.0]},
+            "spread.grasp_position": 1.0,
+            "simulation.steps": 3,
+            "constraints": [
+                {
+                    "name": "apart",
+                    "kind": "distance",
+                    "bodies": [{"frame": "base", "radius": 0.9}],
+                    "obstacles": [{"frame": "grasp", "radius": 0.9}],
+                }
+            ],
+        }
+    )
+    flown = rollout(lambda seen: np.zeros((len(seen), 6)), scene, list(range(6)), record=True)
+    kernels = compile_scene(scene)
+    rows = (kernels.stage_parameters(p)[:-1] for p in flown.parameters)
+    residuals = [
+        kernels.constraints(states[:-1], controls, p=p)[:, 0]
+        for states, controls, p in zip(flown.states, flown.controls, rows, strict=True)
+    ]
+    expected = np.array(residuals) > VISIBLE * path_rows(scene)[0].tolerance
+    flights = prepare([flown.trajectory(i, label="a flight") for i in range(6)], scene)
+    np.testing.assert_array_equal([flight.violated[0, :-1] for flight in flights], expected)
+    assert 0 < expected.all(axis=1).sum() < 6
 
 
 def test_what_the_tip_holds_in_a_phase_counts():
@@ -149,9 +178,9 @@ def test_what_the_tip_holds_in_a_phase_counts():
     states = np.tile(layout.initial_state, (1201, 1))
     states[:, layout.state.joint_rates] = rng.normal(scale=0.3, size=(1201, 3))
     controls, aim = np.zeros((1200, layout.n_u)), np.array(scene.target.pose.dual_quaternion)
-    found = violations(scene, states, controls, aim)
+    found = violations(scene, states, controls, aim, aim)
     laden, empty = (
-        violations(each, states, controls, aim)
+        violations(each, states, controls, aim, aim)
         for each in (scene.replace(phases=()), scene.replace({"phases": (), "payload": None}))
     )
     assert (laden != empty).any(axis=1).all()

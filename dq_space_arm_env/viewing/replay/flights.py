@@ -127,7 +127,7 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
     acting = _acting(own, states[:shown], given_inputs)
     # The page has one list of constraints; limits and targets are the flight's.
     charged = own.replace(constraints=scene.constraints) if own.constraints != scene.constraints else own
-    placed = charged, states[: shown + 1], acting, target if body is None else body
+    placed = charged, states[: shown + 1], acting, target if body is None else body, target
     return ShownFlight(
         label=flight.label,
         controls=controls[:shown],
