@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.scene.parameters import TARGET
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.scene.start import unit_quaternions
 from dq_space_arm_env.task.step_report import n_observations
@@ -173,6 +174,8 @@ class RecedingHorizonExpert:
     def inform(self, parameters: ArrayLike) -> None:
         """Take other parameters in mid-flight, a new target or mass; the next call plans the rest anew.
 
+        Of a target's quaternion q and -q, which cost differently, the one nearer to that before counts.
+
         Args:
             parameters: See `reset`; with a row for each stage, the motion of a target as it is measured and
                 predicted now.
@@ -181,7 +184,14 @@ class RecedingHorizonExpert:
             TypeError: If they are not of real numbers.
             ValueError: If they have another shape or are not finite.
         """
-        self.maneuver.parameters.set(parameters)
+        rows = self.maneuver.parameters.checked(parameters).copy()
+        target = list(self.maneuver.kernels.parameters.indices(TARGET))
+        if target:
+            given = (self.maneuver.parameters.rows, rows)
+            before, after = (self.maneuver.kernels.layout.target_with(each)[:, :4] for each in given)
+            turned = (before * after).sum(axis=1) < 0.0
+            rows[np.ix_(turned, target)] *= -1.0
+        self.maneuver.parameters.set(rows)
         self._informed = True
 
     def __call__(self, observation_or_state: ArrayLike) -> FloatArray:
@@ -212,6 +222,7 @@ class RecedingHorizonExpert:
         if begins:
             self._begin(state, stage)
         else:
+            self._keep_sign(state, stage)
             both_measured = self._measured and not dropped and stage == self._next_stage
             if self._watch.corrects and both_measured and self._work is not None:
                 self._learn(state, stage)
@@ -282,6 +293,13 @@ class RecedingHorizonExpert:
             if ahead <= self._work.problem.horizon:
                 return np.array(states[ahead])
         return np.array(self.plan.solution.states[stage - self.plan.first_stage])
+
+    def _keep_sign(self, state: FloatArray, stage: int) -> None:
+        """Give the base's pose the sign that it had, in place: q and -q cost differently."""
+        layout, pose = self.maneuver.kernels.layout, self.maneuver.kernels.layout.state.pose
+        rotation = slice(pose.start, pose.start + (2 if layout.planar else 4))
+        if state[rotation] @ self._predicted(stage)[rotation] < 0.0:
+            state[pose] *= -1.0
 
     def _of_unit_norm(self, state: FloatArray) -> FloatArray:
         """Return a state with its pose normalized to a unit dual quaternion."""

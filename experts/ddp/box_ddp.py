@@ -51,7 +51,7 @@ CONVERGED = "no step is predicted to reduce the cost"
 
 
 class BoxDDP:
-    """Box-DDP for one problem; it keeps its work arrays between solves, so give each thread its own."""
+    """Box-DDP for one problem. It works in arrays of its own and of the problem: give each thread both."""
 
     def __init__(
         self,
@@ -182,6 +182,7 @@ class BoxDDP:
             stop = shooting.close_gaps(guess, state, self.max_iterations, callback)
         if work.current.failing_stage != FINISHED:
             message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
+            work.current.states[work.current.failing_stage + 1 :] = np.nan  # or an earlier solve's
             return self._solution(state, Stop(StopReason.DIVERGED, message), np.zeros_like(work.update.K))
         state.moved = True
         try:

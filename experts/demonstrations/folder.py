@@ -75,8 +75,7 @@ class Folder:
             )
         for folder in (self.path, self.path / SHARDS, self.path / LOG):
             folder.mkdir(parents=True, exist_ok=True)
-        with _reserved(self.path, self.part, self._remove_leftovers):
-            self._check_settings()
+        with _reserved(self.path, self.part, self._remove_leftovers, self._check_settings):
             yield
 
     def _remove_leftovers(self) -> None:
@@ -185,10 +184,13 @@ def manifest_of(settings: Path, paths: list[Path]) -> dict[str, Any]:
 
 
 @contextmanager
-def _reserved(folder: Path, part: Part, remove_leftovers: Callable[[], None]) -> Iterator[None]:
-    """Lock a part of the work. A run that does all of it excludes any other; parts exclude only that.
+def _reserved(
+    folder: Path, part: Part, remove_leftovers: Callable[[], None], check: Callable[[], None]
+) -> Iterator[None]:
+    """Lock a part of the work, and check its settings while no other part begins.
 
-    Leftovers are removed unless the work is divided in another way beside: then they may be of a living run.
+    A run that does all of it excludes any other; parts exclude only that. Leftovers are removed unless the
+    work is divided in another way beside: then they may be of a living run.
     """
     refusal = DemonstrationsError(
         f"another run is writing to {folder}: wait for it, or choose another folder"
@@ -203,6 +205,7 @@ def _reserved(folder: Path, part: Part, remove_leftovers: Callable[[], None]) ->
             held.enter_context(locked(mine, refusal))
             if not any(map(_is_held, set(log.glob("lock-*")) - set(log.glob(f"lock-*-of-{part.of}")))):
                 remove_leftovers()
+            check()
         yield
 
 

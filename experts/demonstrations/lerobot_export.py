@@ -228,7 +228,7 @@ def _columns(
         "frame_index": stages,
     }
     if kernels.scene.constraints:
-        columns["next.cost"] = demonstration.constraint_costs()
+        columns["next.cost"] = demonstration.constraint_costs()[1:]
     if kernels.parameters.names:
         columns[PARAMETERS] = kernels.stage_parameters(demonstration.parameters)[:-1]
     if kernels.scene.phases:

@@ -265,7 +265,7 @@ def _infos(
         "is_success": misses(kernels, states, parameters) <= 1.0,
     }
     if kernels.scene.constraints:
-        infos["cost"] = np.append(0.0, demonstration.constraint_costs())  # as `reset` and `step` report it
+        infos["cost"] = demonstration.constraint_costs()  # as `reset` and `step` report it
     if kernels.scene.phases:
         infos["phase"] = parameters[:, kernels.parameters.names.index("phase")]
     if parameters.size:

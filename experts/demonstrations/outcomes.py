@@ -8,7 +8,7 @@ solution is kept. Where the solver failed, the best neighbor is tried in any cas
 target is followed as it is, and moved along with the target.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -58,6 +58,7 @@ class Outcome:
     index: int
     seed: int
     start: FloatArray  # state at stage 0, shape (n_x,), units of the state
+    parameters: FloatArray  # what varied in the scene, shape (n_p,)
     solution: Solution
     guess: str  # one of GUESSES
     reason: str  # one of REASONS
@@ -66,12 +67,6 @@ class Outcome:
     def is_good(self) -> bool:
         """Whether it is a demonstration."""
         return self.reason == StopReason.CONVERGED.value
-
-    @property
-    def parameters(self) -> FloatArray:
-        """What varied in the scene, the same at every stage, shape (n_p,)."""
-        first: FloatArray = self.solution.parameters[0]
-        return first
 
 
 class Retry(NamedTuple):
@@ -95,7 +90,7 @@ def solve(expert: Expert, index: int, seed: int, start: FloatArray, parameters: 
     solution = uninterrupted(expert.solver.solve(start, parameters=parameters))
     name = solution.metadata["guess"]
     guess = GUESSES[0] if name.startswith(GUESSES[0]) else name
-    return Outcome(index, seed, start, solution, guess, _judge(expert.problem, solution))
+    return Outcome(index, seed, start, parameters, solution, guess, _judge(expert.problem, solution))
 
 
 def find_better_ways(expert: Expert, outcomes: list[Outcome]) -> list[Retry]:
@@ -121,7 +116,7 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
         )
         solution = uninterrupted(guide.solve(old.start, parameters=old.parameters))
         reason = _judge(expert.problem, solution)
-        new = Outcome(old.index, old.seed, old.start, solution, NEIGHBOR, reason)
+        new = replace(old, solution=solution, guess=NEIGHBOR, reason=reason)
         cheaper = solution.cost < (1.0 - LEAST_GAIN) * old.solution.cost
         if new.is_good and (cheaper or not old.is_good):
             outcomes[retry.position] = new

@@ -94,12 +94,13 @@ class Demonstration:
         """Replay the episode from its first state for `info["cost"]`: violations, each over its tolerance.
 
         Returns:
-            After each action, dimensionless, shape (N,); zeros in a scene without constraints.
+            At the start and after each action, dimensionless, shape (N + 1,); zeros without constraints.
         """
         environment = DQSpaceArmEnv(self.scene)
         varied = {"parameters": self.parameters} if len(self.parameters) else {}
-        environment.reset(options={"initial_state": self.states[0], **varied})
-        return np.array([environment.step(action)[-1].get("cost", 0.0) for action in self.actions])
+        infos = [environment.reset(options={"initial_state": self.states[0], **varied})[1]]
+        infos += [environment.step(action)[-1] for action in self.actions]
+        return np.array([info.get("cost", 0.0) for info in infos])
 
 
 @dataclass(frozen=True, eq=False)

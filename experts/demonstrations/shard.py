@@ -306,6 +306,7 @@ def _failure_arrays(problem: ArmProblem, outcomes: Sequence[Outcome]) -> Arrays:
     starts = np.array([outcome.start for outcome in outcomes]).reshape(-1, problem.n_states)
     last = np.array([outcome.solution.parameters[-1] for outcome in outcomes])
     errors = tip_errors(problem.kernels, ends, last.reshape(len(outcomes), problem.kernels.n_p))
+    errors[~np.isfinite(ends).all(axis=1)] = np.nan
     arrays = {**_common(problem, outcomes), "start": starts, "final_errors": errors}
     return {f"failures.{name}": array for name, array in arrays.items()}
 

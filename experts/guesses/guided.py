@@ -52,7 +52,7 @@ RESERVE = 0.05
 
 
 class GuidedDDP:
-    """Box-DDP that makes its own guesses and reaches the target; give each thread its own.
+    """Box-DDP that makes its own guesses and reaches the target; each thread needs one, of its own problem.
 
     The guesses, cheapest rollout first, are the policies of a library of solved maneuvers and, where all of
     them stray, the screw motion of an arm's tip to its target; then zero controls; in long steps also the
@@ -204,7 +204,8 @@ class GuidedDDP:
         """Minimize the cost from a start.
 
         Args:
-            x0: State at stage 0, shape (n_x,), units of the state; the problem's initial state if None.
+            x0: State at stage 0, shape (n_x,), units of the state; the problem's initial state if None. Of q
+                and -q, which cost differently, `env.reset` gives the base the one nearer to the target.
             callback: Called with the record of every iteration from this start; it may raise
                 KeyboardInterrupt to end the solve.
             parameters: What varies in the problem, shape (n_p,) or (N + 1, n_p), see `BoxDDP.solve`; None

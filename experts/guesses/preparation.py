@@ -10,6 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,7 +47,8 @@ def preparation_key(problem: ArmProblem, settings: Mapping[str, Any]) -> str:
         dict(settings),
         *(np.asarray(array).tolist() for array in numbers),
     ]
-    return cache_key(json.dumps(facts, default=str), source_hash(), _source_hash())
+    versions = (version("numpy"), version("numba"))
+    return cache_key(json.dumps(facts, default=str), source_hash(), _source_hash(), *versions)
 
 
 def read_preparation(key: str) -> Preparation | None:

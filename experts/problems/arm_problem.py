@@ -241,22 +241,22 @@ class ArmProblem:
     @property
     def control_upper(self) -> FloatArray:
         """Limits of the inputs, shape (n_u,); (N, n_u) where a limit is a parameter."""
-        return self.limits(self.parameters)
+        return self.limits(self.parameters.rows)
 
     @property
     def control_lower(self) -> FloatArray:
         """Lower bounds, zero for thrusters."""
         return self.kernels.layout.lower_limits(self.control_upper)
 
-    def limits(self, parameters: StageParameters) -> FloatArray:
-        """Limits of the inputs with given parameters of M stages, shape (n_u,) or (M, n_u).
+    def limits(self, rows: FloatArray) -> FloatArray:
+        """Limits of the inputs with parameters of M stages and the end, (M + 1, n_p): (n_u,) or (M, n_u).
 
         Where a rate is limited and the environment switches off at once, they come down in time.
         """
         layout = self.kernels.layout
         if not self._limits_vary:
             return layout.control_limit
-        limits, slewing = layout.limits_with(parameters.rows[:-1]), slew_limits(self.scene)
+        limits, slewing = layout.limits_with(rows[:-1]), slew_limits(self.scene)
         for control, change in zip(self.rate_limits.controls, self.rate_limits.change, strict=True):
             if control in [each.control for each in slewing]:
                 continue  # it runs down in the environment, too

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 
+import numpy as np
+
 from experts.problems.arm_problem import ArmProblem, carried_along
 from experts.problems.shooting_problem import FloatArray, Kernel, StageParameters
 
@@ -25,6 +27,7 @@ class WindowProblem:
 
     def __init__(self, maneuver: ArmProblem, horizon: int, model: tuple[FloatArray, ...] = ()) -> None:
         self.maneuver, self.horizon, self.ends_early = maneuver, horizon, bool(model)
+        self._first = 0
         n_more = maneuver.parameters.more.shape[1]
         self.parameters = StageParameters(horizon, maneuver.parameters.nominal, n_more=n_more)
         self.constraints = None if self.ends_early else maneuver.constraints_of(self.parameters)
@@ -38,8 +41,10 @@ class WindowProblem:
 
     @property
     def control_upper(self) -> FloatArray:
-        """See `ArmProblem.control_upper`."""
-        return self.maneuver.limits(self.parameters)
+        """See `ArmProblem.control_upper`; they come down in time for what follows the window, too."""
+        following = self.maneuver.parameters.rows[self._first + self.horizon :]
+        limits = self.maneuver.limits(np.vstack([self.parameters.rows[:-1], following]))
+        return limits if limits.ndim == 1 else limits[: self.horizon]
 
     @property
     def control_lower(self) -> FloatArray:
@@ -52,6 +57,7 @@ class WindowProblem:
 
     def begin_at(self, stage: int) -> None:
         """Take the parameters of the maneuver's stages from a stage on."""
+        self._first = stage
         self.parameters.rows[:] = self.maneuver.parameters.rows[stage : stage + self.horizon + 1]
 
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:

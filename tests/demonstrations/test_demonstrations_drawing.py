@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -26,7 +27,7 @@ from experts.command_line.recorded_demonstrations import read_demonstration
 from experts.demonstrations import Demonstrations, DemonstrationsError, SerialExecutor
 from experts.demonstrations.data_card import data_card
 from experts.demonstrations.facts import gather
-from experts.demonstrations.outcomes import NEIGHBOR, Outcome, find_better_ways, solve_again
+from experts.demonstrations.outcomes import NEIGHBOR, find_better_ways, solve_again
 from experts.demonstrations.settings import Settings
 from experts.demonstrations.shard import FAILURES, PARAMETERS, SUMMARIES, TRAJECTORIES, draw_starts
 from experts.demonstrations.tensors import map_tensors
@@ -206,7 +207,7 @@ def test_a_poor_minimum_is_found_out_by_a_neighbor_with_another_target(drawing_s
     solution = poor.solve(old.start, parameters=old.parameters)
     assert solution.cost > 1.002 * old.solution.cost
     reason = StopReason.MAX_ITERATIONS.value
-    outcomes[5] = Outcome(old.index, old.seed, old.start, solution, "zero controls", reason)
+    outcomes[5] = replace(old, solution=solution, guess="zero controls", reason=reason)
     retries = find_better_ways(expert, outcomes)
     assert 5 in [retry.position for retry in retries]
     solve_again(expert, outcomes, retries)

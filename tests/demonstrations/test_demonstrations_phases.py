@@ -1,6 +1,7 @@
 """Demonstrations of a scene with constraints and phases, exported with what the environment reports."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from dq_space_arm_env import Scene
+from dq_space_arm_env import DQSpaceArmEnv, Scene
 from experts import generate_demonstrations
 from experts.demonstrations import (
     Demonstrations,
@@ -64,6 +65,16 @@ def reports(made: Demonstrations) -> list[dict[str, Any]]:
         found.append({name: np.array([row[name] for row in rows]) for name in ("cost", "phase")})
     assert any(report["cost"].max() > 0 for report in found)
     return found
+
+
+def test_costs_are_those_of_reset_and_steps(made: Demonstrations) -> None:
+    states = made[0].states.copy()
+    states[0, made.kernels.layout.state.joint_angles] = 1.5
+    moved, environment = replace(made[0], states=states), DQSpaceArmEnv(made.scene)
+    infos = [environment.reset(options={"initial_state": states[0]})[1]]
+    infos += [environment.step(action)[-1] for action in moved.actions]
+    assert infos[0]["cost"] > 1.0
+    np.testing.assert_array_equal(moved.constraint_costs(), [info["cost"] for info in infos])
 
 
 def test_minari_has_costs_and_phases(

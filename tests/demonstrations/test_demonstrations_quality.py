@@ -1,6 +1,7 @@
 """Only what is optimal, successful and true to the environment is a demonstration."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ def spoil(expert: Expert, outcome: Outcome) -> Outcome:
     solution = BoxDDP(expert.problem, initial_regularization=1.0).solve(outcome.start)
     success = solution.converged and expert.problem.is_success(solution.states, solution.controls)
     reason = StopReason.CONVERGED.value if success else MISSED_TARGET
-    return Outcome(outcome.index, outcome.seed, outcome.start, solution, "zero controls", reason)
+    return replace(outcome, solution=solution, guess="zero controls", reason=reason)
 
 
 @pytest.mark.slow

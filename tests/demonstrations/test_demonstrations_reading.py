@@ -26,7 +26,7 @@ def test_shapes(whole: Demonstrations):
     assert demonstration.facts["guess"] in ("policy", "screw motion", "zero controls", "neighbor")
     for name in SUMMARIES:
         assert whole.column(name).shape[0] == 18
-    np.testing.assert_array_equal(whole[0].constraint_costs(), np.zeros(150))  # nothing to violate
+    np.testing.assert_array_equal(whole[0].constraint_costs(), np.zeros(151))  # nothing to violate
 
 
 def test_they_are_shown_in_a_line(whole: Demonstrations):

@@ -147,3 +147,20 @@ def test_controls_of_limited_rates_are_zero_when_a_phase_switches_them_off():
     assert np.abs(solution.controls[12:]).max() <= 1e-12
     assert cost == pytest.approx(solution.cost, rel=1e-12)
     assert charge <= 1e-12
+
+
+@pytest.mark.slow
+def test_the_receding_horizon_comes_down_in_time_for_what_is_beyond_its_window():
+    scene = closed_in_time({}, [{"kind": "control_rate", "name": "rate", "base_torque": 2.0}])
+    env, expert = DQSpaceArmEnv(scene), RecedingHorizonExpert(scene, horizon=3)
+    env.reset(options={"nominal": True})
+    charge, asked = 0.0, []
+    for stage in range(24):
+        if stage == 2:  # a push, against which it asks for all that there is
+            state = env.get_state()
+            state["x"][env.kernels.layout.state.base_velocity.start] += 3.0
+            env.set_state(state)
+        charge += env.step(expert(env.state))[-1]["cost"]
+        asked.append(expert.control[0])
+    assert min(asked) < -0.75
+    assert charge <= 1e-12

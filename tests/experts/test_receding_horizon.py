@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
+from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.start import unit_quaternions
@@ -521,6 +521,34 @@ def test_a_wild_previous_control_leaves_actions_within_the_limits(short_scene):
     expert.inform(expert.maneuver.parameters.nominal)  # a plan from there begins within the limits
     assert np.abs(expert(wild)).max() <= 1.0
     assert expert.replans == 1
+
+
+def test_a_pose_of_the_other_sign_is_the_same(short_scene):
+    """An estimator may tell either quaternion; the costs of the two differ."""
+
+    def fly(sign):
+        expert, env = RecedingHorizonExpert(short_scene, 10), DQSpaceArmEnv(short_scene)
+        env.reset(options={"nominal": True})
+        actions = []
+        for stage in range(12):
+            state = env.state
+            state[env.kernels.layout.state.pose] *= sign if stage % 2 else 1.0
+            actions.append(expert(state))
+            env.step(actions[-1])
+        return np.array(actions)
+
+    np.testing.assert_array_equal(fly(-1.0), fly(1.0))
+
+
+def test_a_target_of_the_other_sign_is_the_same(varying):
+    maneuver = varying.maneuver
+    told = maneuver.parameters.nominal.copy()
+    told[maneuver.kernels.parameters.indices("target.pose")] *= -1.0
+    assert not np.array_equal(told, maneuver.parameters.nominal)
+    varying.reset()
+    expected = maneuver.parameters.rows.copy()
+    varying.inform(told)
+    np.testing.assert_array_equal(maneuver.parameters.rows, expected)
 
 
 def test_the_plan_knows_what_remains_to_be_paid(plans):

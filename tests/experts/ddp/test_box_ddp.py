@@ -376,6 +376,16 @@ def test_first_rollout_that_diverges_is_reported(double_integrator):
     assert np.all(solution.feedback_gains == 0.0)
 
 
+def test_a_rollout_that_diverges_has_no_states_of_another_solve(double_integrator):
+    solver, start = BoxDDP(double_integrator.problem()), np.array([1e200, 0.0])
+    solver.solve()
+    with np.errstate(over="ignore"):
+        solution = solver.solve(start)
+    assert solution.stop_reason is StopReason.DIVERGED
+    np.testing.assert_array_equal(solution.states[0], start)
+    assert np.isnan(solution.states[1:]).all()
+
+
 def test_trial_that_diverges_is_only_a_refused_step(pendulum):
     """Dynamics that leave the floating-point range at the rates of the first full step."""
 
