@@ -123,8 +123,24 @@ def read_noise(texts: Sequence[str], scene: Scene) -> NDArray[np.float64]:
         if not 0.0 <= sigma < math.inf:
             raise ValueError(f"--noise is {name}{mark}{sigma}; it must be at least 0, a {unit}")
         part = present[name] if mark else slice(None)
+        if mark and _limits_change(layout, scene, part):
+            raise ValueError(
+                f"--noise {text}: phases of scene {scene.name} change the limits of {name}: give a fraction "
+                "of them, for all inputs, such as --noise 0.1"
+            )
         fractions[part] = sigma / layout.control_limit[part] if mark else sigma
     return fractions
+
+
+def _limits_change(layout: StateLayout, scene: Scene, part: slice) -> bool:
+    """Whether inputs have other limits in some phase than in the scene, but for those out of work."""
+    names, staged = layout.parameters.names, scene.staged.values if scene.phases else {}
+    rows = np.tile(layout.parameters.nominal, (max(len(scene.phases), 1), 1))
+    for name, values in staged.items():
+        if name in names:
+            rows[:, names.index(name)] = values
+    limits = layout.limits_with(rows)[:, part]
+    return bool(((limits != layout.control_limit[part]) & (limits != 0.0)).any())
 
 
 def drowned_inputs(noise: NDArray[np.float64], scene: Scene) -> str | None:

@@ -200,9 +200,9 @@ def _add_actuators(root: Element, scene: Scene) -> None:
     actuators = SubElement(root, "actuator")
     for index, transmission in sorted(at.items()):
         motor = SubElement(actuators, "motor", {"name": control.names[index], **transmission})
-        limit = layout.control_limit[index]
-        if math.isfinite(limit):
-            motor.set("ctrlrange", words([layout.lower_limits(layout.control_limit)[index], limit]))
+        limits = layout.lower_limits(layout.control_limit)[index], layout.control_limit[index]
+        if any(map(math.isfinite, limits)):
+            motor.set("ctrlrange", words(limits))
 
 
 def _add_start(root: Element, scene: Scene) -> None:

@@ -252,7 +252,7 @@ class UrdfTree:
 
     def _held(self, joint: UrdfJoint) -> Pose:
         """Pose of a joint's child in its parent, fixed or locked."""
-        coordinate = self._locked_at(joint)
+        coordinate = 0.0 if joint.type == "fixed" else self._locked_at(joint)
         if coordinate == 0.0:
             return joint.origin
         along = _turned_to(joint.axis)

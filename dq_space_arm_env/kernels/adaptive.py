@@ -91,12 +91,14 @@ class IntegratedMotion:
     def global_error(self) -> Array:
         """Estimate the error of the states, by a companion with tolerances 32 times smaller.
 
+        Its `rtol` is at least the smallest of the precision.
+
         Returns:
             Tangent coordinates of the states seen from those of the companion, shape (k, n_t), rad, m, rad/s
             and m/s. The companion takes about twice the steps.
 
         Raises:
-            ValueError: If the tolerances are so small that the precision has none below.
+            ValueError: If `rtol` is so small that the precision has none that is 8 times smaller.
             RuntimeError: If the companion cannot be followed to its end.
         """
         return self.sol.difference(self._finer(self.t).x, self.x)
@@ -176,12 +178,15 @@ def integrate(
     curve = MotionCurve(kernels, np.array(ends), np.array(states), np.array(coefficients))
 
     def finer(wanted: Array) -> IntegratedMotion:
+        least = _smallest_rtol(kernels)
+        if rtol < 8.0 * least:
+            raise ValueError(f"rtol: {rtol}, should be at least {8.0 * least:.1e} to estimate the error")
         return integrate(
             kernels,
             x,
             u,
             duration,
-            rtol=FINER * rtol,
+            rtol=max(FINER * rtol, least),
             atol=FINER * atol,
             times=wanted,
             max_steps=max_steps,
@@ -230,6 +235,11 @@ def _check_smooth(kernels: KernelLibrary, parameters: Array) -> None:
         raise ValueError(f"p: a payload is caught at the end of part {part}, should be 0: use simulate")
 
 
+def _smallest_rtol(kernels: KernelLibrary) -> float:
+    """The smallest relative tolerance of a precision."""
+    return 4.0 * float(np.finfo(kernels.dtype).eps)
+
+
 def _check_accuracy(
     kernels: KernelLibrary, duration: float, rtol: float, atol: float, max_steps: int
 ) -> None:
@@ -239,8 +249,7 @@ def _check_accuracy(
             raise ValueError(f"{name}: {value}, should be a positive number")
     if not np.isfinite(duration) or duration == 0.0:
         raise ValueError(f"duration: {duration} should be a finite time in s other than zero")
-    smallest = np.finfo(kernels.dtype).eps
-    if rtol < 4.0 * smallest:
-        raise ValueError(f"rtol: {rtol}, should be at least {4.0 * smallest:.1e} in {kernels.dtype}")
+    if rtol < (least := _smallest_rtol(kernels)):
+        raise ValueError(f"rtol: {rtol}, should be at least {least:.1e} in {kernels.dtype}")
     if max_steps < 1:
         raise ValueError(f"max_steps: {max_steps}, should be at least 1")

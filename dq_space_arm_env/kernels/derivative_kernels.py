@@ -214,4 +214,6 @@ class DerivativeKernels(ConstraintKernels):
         is_number = isinstance(step, float | int | np.floating | np.integer) and not isinstance(step, bool)
         if not (is_number and isfinite(step)):
             raise ValueError(f"dt: {step!r} is not a finite time step in s")
+        if step == 0 and any(chain.time_constant is not None for chain in self.layout.chains):
+            raise ValueError(f"dt: {step!r}, should not be 0: actuators lag")
         return np.array([step], self.dtype)

@@ -333,6 +333,19 @@ def test_noise_in_units_of_the_actuators() -> None:
     assert flown.noise.std(axis=0) == pytest.approx([2.5] * 3 + [0.5] * 3 + [0.02] * 3, rel=0.2)
 
 
+def test_noise_in_units_needs_limits_that_stay() -> None:
+    changes = {"links.0.torque_limit": 0.2, "actuators.base_force": None}
+    scene = load_scene("planar").replace(
+        {
+            "links.0.torque_limit": 2.0,
+            "phases": [{"name": "all", "steps": 500}, {"name": "weak", "steps": 500, "changes": changes}],
+        }
+    )
+    with pytest.raises(ValueError, match=r"--noise joint_torque=0.1: phases of .* give a fraction of them"):
+        read_noise(["joint_torque=0.1"], scene)
+    assert read_noise(["base_force=1"], scene)[:2] == pytest.approx(0.2)  # what is out of work gives nothing
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [

@@ -138,6 +138,17 @@ def test_the_start_is_a_key_frame(name):
     np.testing.assert_allclose(key.qvel, qvel, rtol=0, atol=1e-14)
 
 
+def test_thrusters_without_a_limit_push_alone():
+    scene = load_scene("thrusters")
+    thrusters = [each.model_copy(update={"force": math.inf}) for each in scene.actuators.thrusters]
+    scene = scene.replace({"actuators.thrusters": [each.model_dump() for each in thrusters]})
+    model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene, wrist="fixed"))
+    control = StateLayout.of(scene).control
+    for name in control.names[control.thruster_force]:
+        assert model.actuator(name).ctrllimited.all()
+        assert model.actuator(name).ctrlrange.tolist() == [0.0, math.inf]
+
+
 def test_motors_have_the_names_and_limits_of_the_inputs():
     scene = load_scene("six-joint")
     scene = scene.replace(actuators={"base_force": {"limit": float("inf")}})

@@ -198,6 +198,16 @@ def test_locked_joints_are_held_where_they_can_be(lower, upper, follows, held):
     np.testing.assert_allclose(found.inertia, expected.inertia, atol=1e-13)
 
 
+def test_what_a_fixed_joint_would_mimic_moves_nothing():
+    aside = BODY.replace("<mass", '<origin xyz="1 0 0"/><mass')
+    follows = '<mimic joint="j1" multiplier="-1" offset="1.57"/>'
+    plain, told = (
+        scene_from_urdf(robot(*GOOD, joint("s", "arm", "l", "fixed", each), link("l", aside)), "arm").links[0]
+        for each in ("", follows)
+    )
+    assert told == plain
+
+
 @pytest.mark.parametrize("number", ["1_5", "٣", "0x1", "1,5"])
 def test_numbers_are_those_of_xml(number):
     with pytest.raises(

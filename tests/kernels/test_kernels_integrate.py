@@ -154,6 +154,15 @@ def test_the_global_error_is_estimated(arm):
         kernels.integrate(x, u, 0.1, rtol=1e-15, atol=1e-15).global_error()
 
 
+def test_the_global_error_is_estimated_in_single_precision(arm):
+    single = compile_scene(arm[0].scene.replace({"simulation.precision": "float32"}))
+    motion = single.integrate(arm[1], np.zeros(single.n_u), 2.0)
+    true = arm[0].difference(followed(*arm, np.zeros(single.n_u), [2.0])[-1], motion.x[-1].astype(float))
+    assert np.abs(motion.global_error()[-1] - true).max() < 1e-4
+    with pytest.raises(ValueError, match=r"rtol: 1e-06, should be at least 3\.8e-06 to estimate"):
+        single.integrate(arm[1], np.zeros(single.n_u), 0.1, rtol=1e-6).global_error()
+
+
 @pytest.mark.slow
 def test_what_happens_step_by_step_is_refused(arm):
     late = compile_scene(arm[0].scene.replace({"actuators.base_torque.delay": 2}))

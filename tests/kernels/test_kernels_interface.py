@@ -74,6 +74,14 @@ def test_wrong_arguments_are_named(call, message, draw):
         call(kernels, states[0], inputs[0])
 
 
+def test_actuators_that_lag_need_a_time(draw):
+    kernels, states, inputs = draw(
+        load_scene("planar").replace({"actuators.base_torque.time_constant": 0.1}), 1
+    )
+    with pytest.raises(ValueError, match=r"dt: 0, should not be 0: actuators lag"):
+        kernels.step(states[0], inputs[0], dt=0)
+
+
 def test_a_call_of_one_row_keeps_its_arrays_alive(draw):
     kernels, states, inputs = draw("paper", 1)
     kernel = kernels.kernel("step", lanes=1)
