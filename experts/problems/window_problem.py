@@ -42,6 +42,8 @@ class WindowProblem:
     @property
     def control_upper(self) -> FloatArray:
         """See `ArmProblem.control_upper`; they come down in time for what follows the window, too."""
+        if not self.rate_limits.controls.size:
+            return self.maneuver.limits(self.parameters.rows)
         following = self.maneuver.parameters.rows[self._first + self.horizon :]
         limits = self.maneuver.limits(np.vstack([self.parameters.rows[:-1], following]))
         return limits if limits.ndim == 1 else limits[: self.horizon]
