@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
@@ -29,14 +28,19 @@ from dq_space_arm_env.environment.reset_options import (
     saved_state,
 )
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
-from dq_space_arm_env.environment.specification import PlainSpec
+from dq_space_arm_env.environment.specification import (
+    PlainSpec,
+    action_space,
+    frames_per_second,
+    observation_space,
+)
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
 from dq_space_arm_env.kernels.stages import present_parameters
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.scene.start import episode_scene
-from dq_space_arm_env.task.step_report import FLAGS, MEMORY, OBSERVATION_LIMIT, REPORT, grouped, report_names
+from dq_space_arm_env.task.step_report import FLAGS, MEMORY, REPORT, grouped, report_names
 from dq_space_arm_env.viewing.payload_places import Payloads, leaves_tip
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 
@@ -280,42 +284,20 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         picture = width, height, default_camera_config
         PicklesEpisodes.__init__(self, scene_to_copy(scene, self.scene), render_mode, *picture)
         self.kernels = compile_scene(self.scene)
-        layout = self.kernels.layout
-        unlimited = [
-            name
-            for name, limit in zip(layout.control.names, layout.control_limit, strict=True)
-            if np.isinf(limit)
-        ]
-        if unlimited or not layout.n_u:
-            problem = f"{', '.join(unlimited)} has no finite limit" if unlimited else "it has no actuator"
-            raise ValueError(
-                f"scene {self.scene.name!r} has no normalized actions: {problem}; give each actuator a finite limit"
-            )
+        self.action_space, self.observation_space = (
+            action_space(self.kernels),
+            observation_space(self.kernels),
+        )
         check_scene(self.scene)
         self.render_mode = render_mode
-        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.scene.simulation.dt))}
-        self.action_space = spaces.Box(-1.0, 1.0, (layout.n_u,), np.float32)
+        self.metadata = {**type(self).metadata, "render_fps": frames_per_second(self.scene)}
         self._bind_kernels()
         names = report_names(self.scene)[1:]
         self._more_names = () if names == REPORT[1:] else names
-        self.observation_space = self._make_observation_space()
         self._begun, self._over = False, True
         self._trail: list[Array] = []
         self._payloads = Payloads(self.kernels, 1) if leaves_tip(self.scene) else None
         self._renderer: Renderer | None = None
-
-    def _make_observation_space(self) -> spaces.Space[Array]:
-        simulation, dtype = self.scene.simulation, self._observation.dtype
-        high = np.full(self._observation.shape, OBSERVATION_LIMIT)
-        real_part = 2 if self.kernels.layout.planar else 4
-        # A unit quaternion and the time left may exceed their bounds by a rounding error.
-        high[:real_part] = 1.0 + 1e-5
-        if self.scene.target.motion is not None:  # seen from the tip, which turns, far from the target
-            high[self.kernels.n_x : -1] = OBSERVATION_LIMIT**2
-        high[-1] = simulation.steps * simulation.dt * (1.0 + 1e-6)
-        low = -high
-        low[-1] = 0.0
-        return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
 
     def _bind_kernels(self) -> None:
         """Allocate the arrays of the compiled functions, whose addresses a step passes unchanged."""

@@ -22,9 +22,8 @@ from dq_space_arm_env.environment.goal_rewards import (
 )
 from dq_space_arm_env.environment.reset_options import checked_options, saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
-from dq_space_arm_env.environment.specification import PlainSpec
+from dq_space_arm_env.environment.specification import PlainSpec, goal_observation_space
 from dq_space_arm_env.scene import Scene
-from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
 
 Array = NDArray[Any]
 
@@ -178,36 +177,12 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
         self.scene, self.kernels = self._env.scene, self._env.kernels
         picture = width, height, default_camera_config
         PicklesEpisodes.__init__(self, scene_to_copy(scene, self.scene), reward_type, render_mode, *picture)
-        if self.scene.other_tips:
-            raise ValueError(
-                f"scene {self.scene.name!r} has tips besides the main one, and a goal is the pose of one tip: use "
-                "DQSpaceArm-v0, or leave other_tips out"
-            )
-        if ending := [each.name for each in self.scene.constraints if each.terminates]:
-            raise ValueError(
-                f"constraint {ending[0]!r} of scene {self.scene.name!r} terminates episodes; where every step "
-                "costs 1, ending early would pay: set terminates: false"
-            )
         self.reward_type, self.render_mode = reward_type, render_mode
         self._goals = GoalRewards(self.kernels, reward_type)
         self.metadata = self._env.metadata
-        layout = self.kernels.layout
-        seen = layout.goal_observation(layout.initial_state, layout.parameters.nominal)
         self.action_space = self._env.action_space
-        self.observation_space: spaces.Space[Any] = spaces.Dict(
-            {
-                "observation": self._box(seen.size, 2 if layout.planar else 4),
-                "achieved_goal": self._box(8, 4),
-                "desired_goal": self._box(8, 4),
-            }
-        )
+        self.observation_space: spaces.Space[Any] = goal_observation_space(self.kernels)
         self._truncated = False
-
-    def _box(self, size: int, real_part: int) -> spaces.Box:
-        """Bounds of numbers that start with a unit quaternion, whose entries may exceed 1 by a rounding error."""
-        high = np.full(size, OBSERVATION_LIMIT, self.kernels.dtype)
-        high[:real_part] = 1.0 + 1e-5
-        return spaces.Box(-high, high, dtype=high.dtype.type)
 
     @property
     def state(self) -> Array:

@@ -12,6 +12,7 @@ from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.scene import Scene
 
 Array = NDArray[Any]
 Observation = dict[str, Array]
@@ -36,6 +37,20 @@ def show_goals(kernels: Kernels, x: Array, parameters: Array) -> Observation:
     return {"observation": seen, **goals}
 
 
+def _check_scene(scene: Scene) -> None:
+    """Raise ValueError for a scene whose task is not one goal."""
+    if scene.other_tips:
+        raise ValueError(
+            f"scene {scene.name!r} has tips besides the main one, and a goal is the pose of one tip: use "
+            "DQSpaceArm-v0, or leave other_tips out"
+        )
+    if ending := [each.name for each in scene.constraints if each.terminates]:
+        raise ValueError(
+            f"constraint {ending[0]!r} of scene {scene.name!r} terminates episodes; where every step "
+            "costs 1, ending early would pay: set terminates: false"
+        )
+
+
 class GoalRewards:
     """Compares goals in machine code, bit-equal for a pair alone and in a batch."""
 
@@ -43,6 +58,7 @@ class GoalRewards:
         if reward_type not in get_args(RewardType):
             kinds = " and ".join(get_args(RewardType))
             raise ValueError(f"reward_type: {reward_type!r} is unknown; choose from {kinds}")
+        _check_scene(kernels.scene)
         self._kernels, self._dense = kernels, reward_type == "dense"
         self._compare_rows = KernelCall(kernels.kernel("environment_goal"), {})
 

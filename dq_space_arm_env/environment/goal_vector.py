@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.environment.goal import DQSpaceArmGoalEnv
 from dq_space_arm_env.environment.goal_rewards import (
     Comparison,
     ComputesRewards,
@@ -20,6 +20,7 @@ from dq_space_arm_env.environment.goal_rewards import (
     show_goals,
 )
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, scene_to_copy
+from dq_space_arm_env.environment.specification import goal_observation_space
 from dq_space_arm_env.environment.sub_environments import Rows, StepResult, SubEnvironments
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.kernels import Kernels
@@ -68,8 +69,8 @@ class DQSpaceArmGoalVectorEnv(ComputesRewards, DQSpaceArmVectorEnv):
         PicklesEpisodes.__init__(self, num_envs, copied, reward_type, autoreset_mode, **kwargs)
         self._seen = None  # a state that is shown again gives the same bits
 
-    def _make_single(self, scene: Scene | Mapping[str, Any] | str | Path) -> DQSpaceArmGoalEnv:
-        return DQSpaceArmGoalEnv(scene, self.reward_type)
+    def _make_observation_space(self) -> spaces.Space[Any]:
+        return goal_observation_space(self.kernels)
 
     def _make_sub_environments(self) -> SubEnvironments:
         self._goals = GoalRewards(self.kernels, self.reward_type)

@@ -37,12 +37,23 @@ class StepResult(NamedTuple):
     addresses: Mapping[str, int]  # of the arrays that compiled functions write, by their names
 
 
-class _Calls(NamedTuple):
+class _Calls:
     """Compiled functions, bound to one of two sets of states."""
 
-    start: KernelCall
-    observe: KernelCall
-    steps: dict[type, KernelCall]  # by the type of the actions
+    def __init__(self, kernels: Kernels, arrays: Mapping[str, Array], after: Mapping[str, Array]) -> None:
+        """Bind them to arrays; a step writes `after` in place of some."""
+        self._kernels, self._arrays = kernels, {**arrays, **after}
+        self.start = KernelCall(kernels.kernel("environment_start"), arrays)
+        self.observe = KernelCall(kernels.kernel("environment_observe"), arrays)
+        self._steps: dict[type, KernelCall] = {}
+        self.step(np.float32)  # the type of the action space; who has other actions waits at the first
+
+    def step(self, kind: type) -> KernelCall:
+        """The step for actions of a type."""
+        if kind not in self._steps:
+            name = "environment_step" if kind is np.float64 else "environment_step_float32_actions"
+            self._steps[kind] = KernelCall(self._kernels.kernel(name), self._arrays)
+        return self._steps[kind]
 
 
 class SubEnvironments:
@@ -81,15 +92,8 @@ class SubEnvironments:
         arrays = {"x": self.x, "memory": self._memory, "memory_kept": self._memory, "draws": self._draws}
         arrays |= {"parameters": self.parameters, "episode_parameters": self.parameters}
         arrays |= self._results.fresh()._asdict()
-        start, observe = (self._kernels.kernel(f"environment_{name}") for name in ("start", "observe"))
-        calls = KernelCall(start, arrays), KernelCall(observe, arrays)
-        arrays |= {"x_kept": self._x_next, "memory_kept": self._memory_next, "following": self._following}
-        names: dict[type, str] = {
-            np.float64: "environment_step",
-            np.float32: "environment_step_float32_actions",
-        }
-        steps = {kind: KernelCall(self._kernels.kernel(name), arrays) for kind, name in names.items()}
-        return _Calls(*calls, steps)
+        after = {"x_kept": self._x_next, "memory_kept": self._memory_next, "following": self._following}
+        return _Calls(self._kernels, arrays, after)
 
     def _swap(self) -> None:
         self.x, self._x_next = self._x_next, self.x
@@ -164,7 +168,7 @@ class SubEnvironments:
         if values.shape != self._action_shape:
             raise ValueError(f"actions: shape {values.shape}, should be {self._action_shape}")
         values = np.ascontiguousarray(values, np.float32 if values.dtype == np.float32 else np.float64)
-        result, call = self._results.take(), self._calls.steps[values.dtype.type]
+        result, call = self._results.take(), self._calls.step(values.dtype.type)
         if self._path is not None:
             stages = np.minimum(self._memory[:, 0].astype(np.int64) + 1, len(self._path) - 1)
             np.take(self._path, stages, axis=0, out=self._following)

@@ -19,12 +19,23 @@ from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.disturbances import displaced
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
-from dq_space_arm_env.environment.reset_options import GivenStart, checked_options, given_start, saved_state
+from dq_space_arm_env.environment.reset_options import (
+    GivenStart,
+    check_scene,
+    checked_options,
+    given_start,
+    saved_state,
+)
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
-from dq_space_arm_env.environment.specification import PlainSpec
+from dq_space_arm_env.environment.specification import (
+    PlainSpec,
+    action_space,
+    frames_per_second,
+    observation_space,
+)
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.task.step_report import grouped, report_names
 from dq_space_arm_env.viewing.payload_places import Payloads, leaves_tip
 from dq_space_arm_env.viewing.picture_format import PictureFormat
@@ -116,18 +127,19 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
             raise ValueError(f"autoreset_mode: {autoreset_mode!r}, should be one of {', '.join(modes)}")
         self._picture = PictureFormat.checked(*picture)
-        single = self._make_single(scene)
-        self.scene, self.kernels = single.scene, compile_scene(single.scene, threads)
+        self.scene = load_scene(scene)
+        self.kernels = compile_scene(self.scene, threads)
         copied = scene_to_copy(scene, self.scene)
         PicklesEpisodes.__init__(self, num_envs, copied, autoreset_mode, render_mode, threads, *picture)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = type(self).metadata | {
-            "render_fps": single.metadata["render_fps"],
+            "render_fps": frames_per_second(self.scene),
             "autoreset_mode": self.autoreset_mode,
         }
-        self.single_action_space: spaces.Space[Any] = single.action_space
-        self.single_observation_space: spaces.Space[Any] = single.observation_space
+        self.single_action_space: spaces.Space[Any] = action_space(self.kernels)
+        self.single_observation_space = self._make_observation_space()
+        check_scene(self.scene)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
@@ -146,9 +158,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         self._payloads = Payloads(self.kernels, num_envs) if leaves_tip(self.scene) else None
         self._renderer: Renderer | None = None
 
-    def _make_single(self, scene: Scene | Mapping[str, Any] | str | Path) -> Any:
-        """Make an environment of the kind that is here many times; it refuses what it cannot take."""
-        return DQSpaceArmEnv(scene)
+    def _make_observation_space(self) -> spaces.Space[Any]:
+        return observation_space(self.kernels)
 
     def _make_sub_environments(self) -> SubEnvironments:
         return SubEnvironments(self.kernels, self.num_envs)

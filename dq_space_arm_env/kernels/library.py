@@ -6,7 +6,8 @@ A process that finds its kernels in the cache neither traces nor compiles, nor d
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, cached_property
 from importlib.metadata import version
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.common.code_cache import cache_key, is_kept
+from dq_space_arm_env.common.code_cache import cache_key, is_kept, keep_code, read_code
 from dq_space_arm_env.common.first_use import announce, compiling
 from dq_space_arm_env.common.host_machine import host_machine
 from dq_space_arm_env.common.real_arrays import real_array
@@ -96,7 +97,7 @@ class KernelLibrary:
     def is_ready(self, name: str, *, integrator: str | None = None, lanes: int | None = None) -> bool:
         """Tell whether a kernel is loaded or cached; the arguments are those of `kernel`."""
         variant = self._variant(name, integrator, lanes)
-        return variant in self._kernels or is_kept(name, self._cache_key(*variant))
+        return variant in self._kernels or is_kept(f"scene.{name}", self._cache_key(*variant))
 
     def _variant(self, name: str, integrator: str | None, lanes: int | None) -> tuple[str, str, int]:
         """Name of a kernel, its integrator, empty where it takes no step, and its lanes."""
@@ -122,16 +123,33 @@ class KernelLibrary:
         return self._paper_kernels[key]
 
     def _load(self, name: str, variant: str, lanes: int, trace: Callable[[], Program]) -> BoundKernel:
-        """Load a kernel from the cache; trace and compile it if it is missing."""
+        """Load a kernel from the cache; trace it if the scene is new, and compile it if its program is.
+
+        The cache has the program's key by the scene's, and the code by the program's: scenes that differ in
+        what a function does not depend on share its code.
+        """
+        of_scene, program = f"scene.{name}", cache(trace)
 
         def build() -> tuple[bytes, dict[str, Any]]:
             from dq_space_arm_env.compiler.build import build_program
 
-            announce(f"scene {self.scene.name!r}")
-            with compiling(lambda: f"{name} of scene {self.scene.name!r}"):
-                return build_program(trace(), lanes, self.scene.simulation.precision)
+            with self._compiling(name):
+                return build_program(program(), lanes, self.scene.simulation.precision)
 
-        return BoundKernel(native.load_or_build(name, self._cache_key(name, variant, lanes), build))
+        scene_key = self._cache_key(name, variant, lanes)
+        known = read_code(of_scene, scene_key)
+        if known is None:
+            with self._compiling(name):
+                known = _program_key(program(), lanes, self.scene.simulation.precision).encode()
+            keep_code(of_scene, scene_key, known)
+        return BoundKernel(native.load_or_build(name, known.decode(), build))
+
+    @contextmanager
+    def _compiling(self, name: str) -> Iterator[None]:
+        """Say what a program is compiled for, while that lasts."""
+        announce(f"scene {self.scene.name!r}")
+        with compiling(lambda: f"{name} of scene {self.scene.name!r}"):
+            yield
 
     def operation_count(self, name: str, *, integrator: str | None = None) -> int:
         """Arithmetic operations of a program per state, after folding and sharing subexpressions."""
@@ -203,8 +221,12 @@ def compile_program(program: Program, lanes: int) -> BoundKernel:
 
         return build_program(program, lanes)
 
-    key = cache_key(repr(program), source_hash(), str(lanes))
-    return BoundKernel(native.load_or_build(program.name, key, build))
+    return BoundKernel(native.load_or_build(program.name, _program_key(program, lanes, "float64"), build))
+
+
+def _program_key(program: Program, lanes: int, precision: str) -> str:
+    """Key of a program's code, which does not depend on what derivatives hold constant."""
+    return cache_key(repr(replace(program, held=set())), source_hash(), str(lanes), precision)
 
 
 def matrices(entries: Array, rows: int, columns: int) -> Array:

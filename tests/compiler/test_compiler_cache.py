@@ -282,6 +282,36 @@ def test_code_of_another_casadi_is_not_taken(monkeypatch):
     assert library.source_hash.__wrapped__() != library.source_hash()
 
 
+def test_scenes_share_the_code_of_what_does_not_depend_on_their_difference(cache, short_scene, monkeypatch):
+    built = []
+
+    def noting(program, *arguments):
+        built.append(program.name)
+        return build_program(program, *arguments)
+
+    monkeypatch.setattr("dq_space_arm_env.compiler.build.build_program", noting)
+    nearer = short_scene.replace(target={"pose": {"position": [0.5, 0.4, 0.0]}}, cost={"joint_torque": 3})
+    lighter = short_scene.replace(base={"mass": 15})
+    x, u = library.KernelLibrary(short_scene).layout.initial_state, [0.1, 0.1]
+    steps, costs = (
+        [library.KernelLibrary(scene).call(name, x=x, u=u)[0] for scene in (short_scene, nearer, lighter)]
+        for name in ("step", "cost")
+    )
+    assert built == ["step", "step", "cost", "cost"]  # the lighter base's step, the nearer target's cost
+    np.testing.assert_array_equal(steps[0], steps[1])
+    assert not np.array_equal(steps[0], steps[2])
+    assert costs[0] != costs[1]
+
+
+def test_code_that_was_removed_is_compiled_again_where_scenes_refer_to_it(cache, short_scene):
+    x = library.KernelLibrary(short_scene).layout.initial_state
+    first = library.KernelLibrary(short_scene).call("tip_pose", x=x)[0]
+    (code,) = cache.glob("tip_pose-*.kernel")
+    code.unlink()
+    np.testing.assert_array_equal(library.KernelLibrary(short_scene).call("tip_pose", x=x)[0], first)
+    assert code.is_file()
+
+
 def test_a_first_use_says_that_it_compiles_and_where_the_result_is(cache):
     code = SECOND_PROCESS + "kernels.linearize(kernels.layout.initial_state, [0.0] * kernels.n_u)\n"
     first, second = (run_process(cache, code).stderr for _ in range(2))

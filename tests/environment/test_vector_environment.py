@@ -61,6 +61,13 @@ def test_bits_are_those_of_single_environments_over_several_episodes(scene, prec
         assert_same(native.step(actions), sync.step(actions), f"step {step}")
 
 
+def test_only_what_a_batch_needs_is_compiled(short_scene):
+    environment = DQSpaceArmVectorEnv(3, short_scene.replace(simulation={"steps": 61}))
+    loaded = {(name, lanes) for name, _, lanes in environment.kernels._kernels}
+    names = "environment_start", "environment_observe", "environment_step_float32_actions"
+    assert loaded == {(name, environment.kernels.lanes) for name in names}
+
+
 def test_threads_give_the_same_bits():
     one, two = (DQSpaceArmVectorEnv(2500, short("random-masses", 4), threads=threads) for threads in (1, 2))
     assert_same(one.reset(seed=0), two.reset(seed=0))

@@ -55,7 +55,7 @@ def test_what_another_process_has_compiled_is_loaded(
     monkeypatch.setattr(build, "build_program", refuse)
     kernels, deadline = Kernels(short_scene), time.monotonic() + 120.0
     with compiling_aside(kernels, REQUESTS):
-        while len(list(cache.glob("*.kernel"))) < len(REQUESTS) and time.monotonic() < deadline:
+        while len(list(cache.glob("scene.*.kernel"))) < len(REQUESTS) and time.monotonic() < deadline:
             time.sleep(0.05)
     assert all(kernels.is_ready(**request._asdict()) for request in REQUESTS)
     assert energy(kernels) >= 0.0

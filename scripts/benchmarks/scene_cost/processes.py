@@ -51,14 +51,15 @@ import json, os, sys, time
 from pathlib import Path
 cache, stages, found, names = Path(os.environ["DQ_SPACE_ARM_CACHE"]), json.loads(input()), [], {}
 for stage in stages:
-    modules, kernels = set(sys.modules), set(cache.glob("*.kernel"))
+    modules, kernels = set(sys.modules), set(cache.glob("scene.*"))
     start = time.perf_counter()
     exec(stage, names)
     seconds = time.perf_counter() - start
+    added = set(cache.glob("scene.*")) - kernels
     found.append({
         "seconds": seconds,
         "modules": sorted(set(sys.modules) - modules),
-        "kernels": sorted(path.name.rpartition("-")[0] for path in set(cache.glob("*.kernel")) - kernels),
+        "kernels": sorted(path.name[6:].rpartition("-")[0] for path in added),
     })
 print(json.dumps(found))
 """
