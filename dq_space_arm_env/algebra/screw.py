@@ -1,4 +1,4 @@
-"""Screw motion: exponential and logarithm of poses, screw parameters, interpolation, and their derivatives.
+"""Screw motion: exponential and logarithm of poses, interpolation, and their derivatives.
 
 A twist xi is a dual vector, a rotation vector and a translation-like vector, in rad and m, and exp(xi) stands
 for the pose exp(1/2 (xi_r + eps xi_d)). With it the kinematics (8) at a constant dual velocity w over a time
@@ -17,9 +17,6 @@ __all__ = [
     "logarithm",
     "power",
 ]
-
-# A rotation below this angle, in rad, counts as none in `screw_parameters`: its axis would be out of range.
-_PURE_TRANSLATION_BELOW = 1e-150
 
 
 def exponential(twist: Components) -> DualQuaternion:

@@ -14,6 +14,9 @@ from dq_space_arm_env.compiler.program import Buffer, Program, place
 from dq_space_arm_env.compiler.transpose import ArrayAccess
 from dq_space_arm_env.compiler.vector_builder import ELEMENTS, INDEX, POINTER, BlockBuilder, Target
 
+_LARGEST_FRAME = 2**18
+"""Bytes of a program's scratch memory on the stack, of which a thread may have half a megabyte."""
+
 
 def assembly(program: Program, lanes: int, precision: str = "float64") -> str:
     """LLVM assembly of a program that works on `lanes` rows at a time, before optimization."""
@@ -65,9 +68,8 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     arrays = _Arrays(builder, program, addresses)
     starts, total = place(sizes, program.lifetimes())
     program.check_memory(starts)
-    stack = builder.alloca(vectors.type, size=INDEX(max(total, 1)))
-    stack.align = vectors.alignment
-    blocks = {name: vectors.address(stack, start) for name, start in starts.items()}
+    scratch, borrowed = _scratch(vectors, max(total, 1))
+    blocks = {name: vectors.address(scratch, start) for name, start in starts.items()}
     for name in zeroed:
         _clear(builder, blocks[name], vectors.alignment * sizes[name])
     builder.branch(head)
@@ -103,7 +105,22 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     builder.branch(head)
 
     builder.position_at_end(done)
+    if borrowed is not None:
+        builder.call(ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER]), "free"), [borrowed])
     builder.ret_void()
+
+
+def _scratch(vectors: BlockBuilder, count: int) -> tuple[ir.Value, ir.Value | None]:
+    """Memory for so many vectors: on the stack, or, where threads might overflow theirs, to be freed."""
+    builder, size = vectors.ir, count * vectors.alignment
+    if size <= _LARGEST_FRAME:
+        stack = builder.alloca(vectors.type, size=INDEX(count))
+        stack.align = vectors.alignment
+        return stack, None
+    allocate = ir.Function(builder.module, ir.FunctionType(POINTER, [INDEX]), "malloc")
+    borrowed = builder.call(allocate, [INDEX(size + vectors.alignment)])
+    beyond = builder.add(builder.ptrtoint(borrowed, INDEX), INDEX(vectors.alignment - 1))
+    return builder.inttoptr(builder.and_(beyond, INDEX(-vectors.alignment)), POINTER), borrowed
 
 
 def _emit_calls(

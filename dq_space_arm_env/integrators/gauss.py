@@ -188,14 +188,15 @@ class _Graphs:
         return handed
 
     def _wrapped(self) -> list[Scalar]:
-        """The start without the pose, angles of joints without a spring within half a turn.
+        """The start without the pose, angles of revolute joints without a spring within half a turn.
 
-        Increments are added to them: the digits of many turns would be missing behind the point.
+        Increments are added to them: the digits of many turns would be missing behind the point. Where a
+        joint slides, another turn is another place.
         """
         y = list(split_state(self.field, self.x)[1])
         stiffness, _ = self.equations.passive_slopes(self.given.start(y)["local"])
         for j, index in enumerate(self.given.shape_indices[: self.joints]):
-            if not stiffness[j, :].nnz():
+            if not stiffness[j, :].nnz() and not self.field.tree.links[j].screw.slide:
                 turns = casadi.floor(y[index] * (0.5 / math.pi) + 0.5)
                 for part in _TURN:
                     y[index] = y[index] - turns * part

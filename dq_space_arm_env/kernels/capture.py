@@ -56,6 +56,11 @@ def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: A
     twist = _finite("payload_twist", payload_twist, 6)
     layout, where = free.layout, free.layout.state
     directions = PLANAR_TWIST if layout.planar else tuple(range(6))
+    if np.delete(twist, directions).any():
+        raise ValueError(
+            f"payload_twist: {twist} leaves the plane of scene {free.scene.name!r}, should be zero but for "
+            "w_z, v_x and v_y, the entries 2 to 4"
+        )
     base = spread(state[where.base_velocity].tolist(), directions, 6)
     tree = KinematicTree.from_scene(free.scene)
     left = state[where.propellant].tolist()

@@ -27,7 +27,7 @@ class DerivativeKernels(ConstraintKernels):
         integrator: str | None = None,
         p: ArrayLike | None = None,
     ) -> tuple[Array, Array]:
-        """Exact derivatives of a step in tangent coordinates: dx+ = A dx + B du.
+        """Exact derivatives of a step in tangent coordinates, lengths of substeps held: dx+ = A dx + B du.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).

@@ -57,6 +57,8 @@ class Kernels(DerivativeKernels):
     ) -> Array:
         """Advance states by one time step under constant inputs.
 
+        Quaternions of x have unit length, but for what rounding changes, which a step corrects.
+
         Args:
             x: States, shape (n_x,) or (B, n_x), units of `layout.state`.
             u: Inputs, shape (n_u,) or (B, n_u), units of `layout.control`; not clipped to the limits.
@@ -145,9 +147,9 @@ class Kernels(DerivativeKernels):
         """Take many steps in a row without returning to Python.
 
         The results are those of repeated calls of `step`, except for integrators that conserve the momentum:
-        they hand it on from step to step besides the state, as long as masses stay, so it does not wander
-        with the rounding errors of the states. `gauss6` also hands on what rounding cuts off the joint
-        angles.
+        they hand it on from step to step besides the state, so it does not wander with the rounding errors of
+        the states, where masses stay and actuators follow at once. `gauss6` also hands on what rounding cuts
+        off the joint angles.
 
         Args:
             x: State at the start, shape (n_x,), units of `layout.state`.

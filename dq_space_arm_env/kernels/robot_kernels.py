@@ -47,7 +47,9 @@ class RobotKernels(KernelLibrary):
             p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
-            fx, fy, fz [N], tx, ty [N m] joint by joint, shape (5 n,) or (B, 5 n).
+            fx, fy, fz [N], tx, ty [N m] joint by joint, of prismatic joints fx, fy [N], tx, ty, tz [N m], of
+            spherical ones fx, fy, fz, of fixed ones nothing; shape (5 n,) or (B, 5 n) where all move by one
+            coordinate.
         """
         return self.call("reaction_wrenches", x=x, u=u, p=p)[0]
 
@@ -56,11 +58,11 @@ class RobotKernels(KernelLibrary):
 
         The accelerations a are those of `forward_dynamics`: base angular [rad/s^2], base linear [m/s^2], both
         in base axes, then joints [rad/s^2]. The generalized forces f are dual to them: torque on the base
-        about its center of mass [N m], force [N], both in base axes, then joint torques [N m]. Inputs u have
-        the base's force before its torque.
+        about its origin [N m], force [N], both in base axes, then joint torques [N m]. Inputs u have the
+        base's force before its torque.
 
         Args:
-            x: States, shape (n_x,) or (B, n_x); only the joint angles matter.
+            x: States, shape (n_x,) or (B, n_x); only joint angles, and propellant, matter.
             p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:

@@ -1,6 +1,7 @@
 """Machine code: operations against NumPy and mpmath, lanes against scalars, rows, instructions."""
 
 import platform
+import threading
 
 import casadi
 import mpmath
@@ -246,6 +247,25 @@ def test_calls_share_code_and_scratch_starts_as_zero():
         np.testing.assert_array_equal(y, 2 * x)
     assert program.operation_count == 2
     assert assembly(program, 1).count("define internal") == 1
+
+
+def test_programs_that_need_more_memory_than_a_small_stack_run_on_it():
+    lanes = native.host_machine().lanes
+    size = 2**18 // (8 * lanes) + 1
+    spread = trace("spread", {"x": 1}, lambda x: {"a": [x[0]] * size})
+    gathered = trace("gathered", {"a": size}, lambda a: {"y": [a[0] + a[size - 1]]})
+    program = Program("program", [Buffer("x", 1)], [Buffer("y", 1)])
+    program.call(spread)
+    program.call(gathered)
+    x, y = np.arange(9.0)[:, None].copy(), np.zeros((9, 1))
+    before = threading.stack_size(2**18)
+    try:
+        thread = threading.Thread(target=run, args=(program, lanes, 9, x, y))
+        thread.start()
+        thread.join()
+    finally:
+        threading.stack_size(before)
+    np.testing.assert_array_equal(y, 2 * x)
 
 
 def test_calls_that_disagree_on_a_size_are_refused():

@@ -191,6 +191,16 @@ def test_angles_of_many_turns_cost_no_digits():
     np.testing.assert_allclose(*rates, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("joint", ["boom", "drive"])
+def test_joints_that_slide_far_are_where_they_are(joint):
+    """3.5 m and 3.5 rad, beyond half a turn, where only joints that do nothing but turn may be wrapped."""
+    kernels = compile_scene("sliding")
+    x, u, where = moving_start(kernels), np.zeros(kernels.n_u), kernels.layout.state.joint_angles
+    place = next(i for i, name in enumerate(kernels.layout.state.names[where]) if name.startswith(joint))
+    x[where.start + place] = 3.5
+    assert np.abs(kernels.step(x, u, STEP, NAME) - kernels.step(x, u, STEP, "rk8")).max() < 1e-14
+
+
 def test_a_free_body_turns_by_the_exact_momentum():
     """Torque-free precession of a body without joints: energy and momentum at every step."""
     kernels = free_body()

@@ -292,6 +292,15 @@ def test_a_catch_in_an_episode_is_that_of_a_single_call() -> None:
     assert np.abs(after - expected).max() < 1e-14
 
 
+def test_a_payload_of_the_plane_moves_within_it() -> None:
+    held = load_scene("planar").replace(payload={"mass": 5.0, "inertia": [1.0, 1.0, 1.0]})
+    kernels = [compile_scene(scene) for scene in (held.replace(payload=None), held)]
+    x = kernels[0].layout.initial_state
+    assert np.isfinite(catch_payload(*kernels, x, [0, 0, 0.3, 0.1, 0.2, 0])).all()
+    with pytest.raises(ValueError, match=r"payload_twist: .* leaves the plane of scene 'planar'"):
+        catch_payload(*kernels, x, [0, 0, 0.3, 0.1, 0.2, 5.0])
+
+
 def test_derivatives_across_a_catch() -> None:
     """Against central differences, extrapolated to order 6."""
     kernels = compile_scene(SCENES["capture-and-detumble"])
