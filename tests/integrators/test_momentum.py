@@ -60,15 +60,8 @@ def test_internal_torques_keep_the_momentum_to_rounding(name, scene):
     assert by_rk4 < 1e-5 or scene == "six-joint"  # its joints reach 20 rad/s
 
 
-def durations():
-    """Each method for many steps, the cheapest for ten million too; the others when minutes do not count."""
-    for name in METHODS:
-        yield name, 100_000
-        quick = name == "momentum_rk4"
-        yield pytest.param(name, 10_000_000, marks=pytest.mark.slow if quick else pytest.mark.endurance)
-
-
-@pytest.mark.parametrize(("name", "steps"), list(durations()))
+@pytest.mark.parametrize("steps", [100_000, pytest.param(10_000_000, marks=pytest.mark.endurance)])
+@pytest.mark.parametrize("name", METHODS)
 def test_momentum_over_many_steps(name, steps):
     kernels = compile_scene("paper")
     states = slow_walk(kernels, np.zeros(kernels.n_u), steps, name, steps // 1000)
