@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from gymnasium import Wrapper, spaces
 from gymnasium.utils import EzPickle
-from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
-from gymnasium.wrappers.vector import RescaleAction
+from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv, VectorRewardWrapper
+from gymnasium.wrappers.vector import DictInfoToList, NormalizeReward, RescaleAction
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
@@ -43,6 +43,7 @@ class SB3VecEnv(VecEnv):
       fly without the wrapper, as `evaluate` and `export_policy` read it there.
     - Returns and lengths are those of the environment inside `agents.wrappers.vector.ShapeReward` and
       `RepeatAction`: they show rewards that are not shaped, and time steps, as a `Monitor` inside does.
+      Gymnasium's wrappers of rewards count as part of the environment unless they are around one of these.
 
     Attributes:
         vector_env: The vector environment.
@@ -60,6 +61,7 @@ class SB3VecEnv(VecEnv):
             step_infos: Whether infos are given at every step.
 
         Raises:
+            TypeError: If infos are lists, as `DictInfoToList` makes them.
             ValueError: If the autoreset mode is another one.
         """
         mode = vector_env.metadata.get("autoreset_mode")
@@ -70,6 +72,8 @@ class SB3VecEnv(VecEnv):
             )
         self.vector_env = vector_env
         self._chain = chain(vector_env)
+        if any(isinstance(env, DictInfoToList) for env in self._chain):
+            raise TypeError("vector_env: in DictInfoToList, whose work this class does itself: leave it out")
         self._given = frozenset(name for env in self._chain for name in dir(env))
         self._repeater = next((env for env in reversed(self._chain) if isinstance(env, RepeatAction)), None)
         space = _in_single_precision(vector_env.single_observation_space)
@@ -240,14 +244,27 @@ class SB3VecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Read an attribute of the vector environment, which all copies share, once per copy in `indices`.
 
-        Wrappers that lack it pass it on. Spaces are those of one copy, as in this class.
+        Wrappers that lack it pass it on, and Gymnasium's own vector environments to their copies. Spaces are
+        those of one copy, as in this class.
         """
+        copies = self._checked(indices)
+        if call := self._call_of_copies(attr_name):
+            values = call("get_wrapper_attr", attr_name)
+            return [values[i] for i in copies]
         home = self if attr_name in ("observation_space", "action_space") else self._home(attr_name)
-        return [getattr(home, attr_name)] * len(self._checked(indices))
+        return [getattr(home, attr_name)] * len(copies)
 
     def _home(self, attr_name: str) -> Any:
         """The outermost wrapper with an attribute, or the environment."""
         return next((env for env in self._chain if hasattr(env, attr_name)), self.vector_env.unwrapped)
+
+    def _call_of_copies(self, attr_name: str) -> Any:
+        """`call` of Gymnasium's `SyncVectorEnv` or `AsyncVectorEnv` if only their copies have it, or None."""
+        call = getattr(self.vector_env.unwrapped, "call", None)
+        if call is None or any(hasattr(env, attr_name) for env in self._chain):
+            return None
+        # Asked first: a copy in another process ends with an error.
+        return call if all(call("has_wrapper_attr", attr_name)) else None
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Set an attribute of your own on the vector environment, for all copies; `indices` must be all.
@@ -270,8 +287,9 @@ class SB3VecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of the vector environment once for all copies; `indices` must be all.
 
-        Some alone may be asked for `compute_reward`, which depends on none of them. `reset` and `step` are
-        refused: they would bypass the episode statistics.
+        Some alone may be asked for `compute_reward`, which depends on none of them, and which is refused in
+        wrappers that change rewards. `reset` and `step` are refused: they would bypass the episode
+        statistics.
         """
         if method_name != "compute_reward":
             self._require_all(indices, f"method {method_name!r}")
@@ -280,8 +298,17 @@ class SB3VecEnv(VecEnv):
                 f"method {method_name!r} would bypass the episode statistics: "
                 f"call that of {type(self).__name__}"
             )
+        changing = [env for env in self._chain if isinstance(env, VectorRewardWrapper | NormalizeReward)]
+        if method_name == "compute_reward" and changing:
+            raise ValueError(
+                f"method 'compute_reward' gives rewards without {type(changing[0]).__name__}: leave it out"
+            )
+        copies = self._checked(indices)
+        if call := self._call_of_copies(method_name):
+            results = call(method_name, *method_args, **method_kwargs)
+            return [results[i] for i in copies]
         method = getattr(self._home(method_name), method_name)
-        return [method(*method_args, **method_kwargs)] * len(self._checked(indices))
+        return [method(*method_args, **method_kwargs)] * len(copies)
 
     def env_is_wrapped(
         self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: int | Iterable[int] | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, NoReturn, get_args
 
 import numpy as np
 from gymnasium import spaces
@@ -35,6 +35,14 @@ def _check_number(name: str, value: Any) -> None:
     """Raise TypeError for what is not one real number."""
     if real_array(name, value).shape:
         raise TypeError(f"{name}: {value!r}, should be one number")
+
+
+def refuse_relabeling(*arguments: Any, **named: Any) -> NoReturn:
+    """Stand in for the `compute_reward` inside a wrapper whose rewards it does not know."""
+    raise ValueError(
+        "compute_reward: it gives the reward of one time step, not sums or shaped rewards: leave ShapeReward "
+        "out, and hold actions by RepeatAction(env, n, reward='last')"
+    )
 
 
 def held_metadata(metadata: dict[str, Any], repeat: int) -> dict[str, Any]:

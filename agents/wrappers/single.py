@@ -10,7 +10,14 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike
 
-from agents.wrappers.shaping import HeldReward, Shaping, check_repeat, held_metadata, shrunk
+from agents.wrappers.shaping import (
+    HeldReward,
+    Shaping,
+    check_repeat,
+    held_metadata,
+    refuse_relabeling,
+    shrunk,
+)
 
 Env = gymnasium.Env[Any, Any]
 Result = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
@@ -60,6 +67,8 @@ class RepeatAction(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         gymnasium.Wrapper.__init__(self, env)
         self.repeat, self.steps_taken, self.largest_cost = int(repeat), 0, 0.0
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
+        if self._sum and self.repeat > 1:
+            self.compute_reward = refuse_relabeling
         self.metadata = held_metadata(env.metadata, self.repeat)
 
     def step(self, action: Any) -> Result:
@@ -154,6 +163,7 @@ class ShapeReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, **settings)
         gymnasium.Wrapper.__init__(self, env)
         self.unshaped = 0.0
+        self.compute_reward = refuse_relabeling
         self._shaping = Shaping.checked(getattr(env.unwrapped, "scene", None), _held_steps(env), **settings)
 
     def step(self, action: Any) -> Result:

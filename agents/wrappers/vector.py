@@ -11,7 +11,14 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv, Vect
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from agents.wrappers.shaping import HeldReward, Shaping, check_repeat, held_metadata, shrunk
+from agents.wrappers.shaping import (
+    HeldReward,
+    Shaping,
+    check_repeat,
+    held_metadata,
+    refuse_relabeling,
+    shrunk,
+)
 from agents.wrappers.vector_infos import Info, Rows, merged, single_infos, with_rows
 
 Mask = NDArray[np.bool_]
@@ -84,6 +91,8 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         self.repeat, self.steps_taken = int(repeat), np.zeros(env.num_envs, dtype=np.int64)
         self.collected, self.largest_cost = np.zeros(env.num_envs), np.zeros(env.num_envs)
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
+        if self._sum and self.repeat > 1:
+            self.compute_reward = refuse_relabeling
         self.metadata = held_metadata(env.metadata, self.repeat)
 
     def step(self, actions: Any) -> Result:
@@ -245,6 +254,7 @@ class ShapeReward(VectorWrapper[Any, Any, Any, Any, Any]):
         """
         super().__init__(env)
         self.unshaped = np.zeros(env.num_envs)
+        self.compute_reward = refuse_relabeling
         self._shaping = Shaping.checked(
             getattr(env.unwrapped, "scene", None),
             math.prod(each.repeat for each in chain(env) if isinstance(each, RepeatAction)),

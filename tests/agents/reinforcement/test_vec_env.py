@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList, TransformReward
 
 pytest.importorskip("stable_baselines3")
 
@@ -213,6 +214,50 @@ def test_native_goals_are_those_of_held_and_monitored_single_environments():
     for venv in (native, singles):  # as hindsight asks
         (rewards,) = venv.env_method("compute_reward", *goals, [{}] * 3, indices=[0])
         np.testing.assert_array_equal(rewards, [-1.0] * 3)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "message"),
+    [
+        (
+            lambda env: vector.ShapeReward(vector.RepeatAction(env, 3, reward="last"), 0.01),
+            "leave ShapeReward",
+        ),
+        (lambda env: vector.RepeatAction(env, 3), "reward='last'"),
+        (lambda env: TransformReward(env, np.float32), "without TransformReward: leave it out"),
+    ],
+)
+def test_hindsight_is_refused_where_stored_rewards_are_others(wrap, message):
+    goals = gymnasium.make_vec("DQSpaceArmGoal-v0", 2, scene=SHORT, autoreset_mode=AutoresetMode.SAME_STEP)
+    with pytest.raises(ValueError, match=message):
+        SB3VecEnv(wrap(goals)).env_method("compute_reward", np.zeros((2, 8)), np.zeros((2, 8)), None)
+
+
+def test_copies_of_gymnasiums_own_vector_environments_are_asked():
+    def single(**wrapper):
+        return RepeatAction(gymnasium.make("DQSpaceArmGoal-v0", scene=SHORT), 3, **wrapper)
+
+    def adapted(**wrapper):
+        return SB3VecEnv(
+            SyncVectorEnv([lambda: single(**wrapper)] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
+        )
+
+    venv = adapted(reward="last")
+    assert venv.get_attr("reward_type", indices=[1]) == ["sparse"]
+    assert venv.get_attr("scene") == [SHORT] * 2
+    assert (venv.has_attr("compute_reward"), venv.has_attr("nothing")) == (True, False)
+    goal = np.eye(8)[:1]
+    (rewards,) = venv.env_method("compute_reward", goal, goal, None, indices=[0])
+    np.testing.assert_array_equal(rewards, [0.0])
+    assert venv.env_method("compute_terminated", goal, goal) == [False, False]
+    with pytest.raises(ValueError, match="sums or shaped rewards"):
+        adapted(reward="sum").env_method("compute_reward", goal, goal, None)
+
+
+def test_infos_as_lists_are_refused():
+    native = DQSpaceArmVectorEnv(2, SHORT, autoreset_mode=AutoresetMode.SAME_STEP)
+    with pytest.raises(TypeError, match=r"in DictInfoToList, .*: leave it out"):
+        SB3VecEnv(DictInfoToList(native))
 
 
 def test_vector_environments_that_reset_at_the_next_step_are_refused():
