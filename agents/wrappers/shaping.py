@@ -99,14 +99,12 @@ class Shaping(NamedTuple):
     power: float
     success_reward: float
     end_error_cost: float
-    steps: int  # time steps of a decision
     tolerances: Sequence[float | None]  # of ERRORS; None for those that do not count
 
     @classmethod
     def checked(
         cls,
         scene: Any,
-        steps: int,
         *,
         scale: float,
         power: float,
@@ -138,14 +136,14 @@ class Shaping(NamedTuple):
                 wanted.angular_velocity_error_deg,
                 wanted.velocity_error,
             )
-        return cls(scale, power, success_reward, end_error_cost, steps, tolerances)
+        return cls(scale, power, success_reward, end_error_cost, tolerances)
 
-    def of_steps(self, rewards: ArrayLike) -> NDArray[np.float32]:
-        """Power and scale of rewards, shape (B,), each of `steps` time steps."""
+    def of_steps(self, rewards: ArrayLike, steps: int | NDArray[np.int64]) -> NDArray[np.float32]:
+        """Power and scale of rewards, shape (B,), of so many time steps each."""
         values = np.asarray(rewards)
         if self.power != 1.0:
             # sign(r) n |r / n|^p, with the mean r / n of the n steps.
-            values = np.sign(values) * self.steps * np.abs(values / self.steps) ** self.power
+            values = np.sign(values) * steps * np.abs(values / steps) ** self.power
         return np.asarray(self.scale * values, dtype=np.float32)
 
     def of_ends(self, info: Mapping[str, Any]) -> NDArray[np.float32]:

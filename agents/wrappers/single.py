@@ -119,7 +119,7 @@ class ShrinkActionSpace(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
 class ShapeReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Shapes rewards for learners.
 
-    The reward r of a decision of n time steps, those of the `RepeatAction` inside, becomes
+    The reward r of a decision of n time steps, those that the `RepeatAction` inside has taken, becomes
     s n sign(r) |r / n|^p, with the scale s and the power p: with 1/2 the quadratic cost grows like the error,
     so that the last centimeters, a thousandth of a maneuver's cost, are worth the effort. Terms at the end of
     an episode are not scaled: `success_reward` pays for success; `end_error_cost` charges the final errors
@@ -164,22 +164,24 @@ class ShapeReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gymnasium.Wrapper.__init__(self, env)
         self.unshaped = 0.0
         self.compute_reward = refuse_relabeling
-        self._shaping = Shaping.checked(getattr(env.unwrapped, "scene", None), _held_steps(env), **settings)
+        self._shaping = Shaping.checked(getattr(env.unwrapped, "scene", None), **settings)
 
     def step(self, action: Any) -> Result:
         """Take a step whose reward is shaped, see `gymnasium.Env.step`."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.unshaped = float(reward)
-        shaped = self._shaping.of_steps([self.unshaped])
+        shaped = self._shaping.of_steps([self.unshaped], _steps_taken(self.env)[0])
         if (terminated or truncated) and self._shaping.counts_ends:
             shaped += self._shaping.of_ends(info)
         return observation, float(shaped[0]), terminated, truncated, info
 
 
-def _held_steps(env: Env) -> int:
-    """Time steps of a decision."""
-    steps = 1
-    while isinstance(env, gymnasium.Wrapper):
-        steps *= env.repeat if isinstance(env, RepeatAction) else 1
-        env = env.env
-    return steps
+def _steps_taken(env: Env) -> tuple[int, int]:
+    """Time steps of the last decision, and of one that no end of an episode has cut short."""
+    if not isinstance(env, gymnasium.Wrapper):
+        return 1, 1
+    taken, whole = _steps_taken(env.env)
+    if not isinstance(env, RepeatAction):
+        return taken, whole
+    # Of the decisions that one around them consists of, the last may be short.
+    return (env.steps_taken - 1) * whole + taken, env.repeat * whole

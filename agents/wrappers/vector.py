@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -255,9 +254,9 @@ class ShapeReward(VectorWrapper[Any, Any, Any, Any, Any]):
         super().__init__(env)
         self.unshaped = np.zeros(env.num_envs)
         self.compute_reward = refuse_relabeling
+        self._repeater = next((each for each in chain(env) if isinstance(each, RepeatAction)), None)
         self._shaping = Shaping.checked(
             getattr(env.unwrapped, "scene", None),
-            math.prod(each.repeat for each in chain(env) if isinstance(each, RepeatAction)),
             scale=scale,
             power=power,
             success_reward=success_reward,
@@ -267,7 +266,9 @@ class ShapeReward(VectorWrapper[Any, Any, Any, Any, Any]):
     def step(self, actions: Any) -> Result:
         """Take a step whose rewards are shaped, see `gymnasium.vector.VectorEnv.step`."""
         observations, self.unshaped, terminated, truncated, info = self.env.step(actions)
-        shaped = self._shaping.of_steps(self.unshaped)
+        # A step that was a reset has no time steps, and no reward.
+        steps = 1 if self._repeater is None else np.maximum(self._repeater.steps_taken, 1)
+        shaped = self._shaping.of_steps(self.unshaped, steps)
         if self._shaping.counts_ends and (ended := terminated | truncated).any():
             shaped[ended] += self._shaping.of_ends(info.get("final_info", info))[ended]
         return observations, shaped, terminated, truncated, info

@@ -151,8 +151,22 @@ def test_a_power_is_that_of_the_mean_and_keeps_the_sign():
     reward = vector.ShapeReward(
         vector.RepeatAction(gymnasium.make_vec("DQSpaceArm-v0", 2, scene=EIGHT_STEPS), 4), 3.0, 0.5
     )
-    shaped = reward._shaping.of_steps([-16.0, 64.0, 0.0])
+    shaped = reward._shaping.of_steps([-16.0, 64.0, 0.0], 4)
     np.testing.assert_array_equal(shaped, np.float32([-3.0 * 4 * 2.0, 3.0 * 4 * 4.0, 0.0]))
+
+
+@pytest.mark.parametrize(("repeats", "lengths"), [([6], [6, 2]), ([2, 2], [4, 4]), ([3, 2], [6, 2])])
+def test_the_mean_of_a_short_decision_is_that_of_its_own_steps(repeats, lengths):
+    """With one repetition inside another too."""
+    env = gymnasium.make("DQSpaceArm-v0", scene=EIGHT_STEPS)
+    for repeat in repeats:
+        env = RepeatAction(env, repeat)
+    env = ShapeReward(env, 3.0, 0.5)
+    env.reset(seed=0)
+    for steps in lengths:
+        _, reward, over, _, _ = env.step(STILL)
+        assert reward == pytest.approx(-3.0 * steps * np.sqrt(-env.unshaped / steps), rel=1e-6)
+    assert over
 
 
 def last_rewards(env):
