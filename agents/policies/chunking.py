@@ -43,7 +43,7 @@ NORM_EPSILON = 1e-5
 
 
 class Ensemble:
-    """Means of the chunks of B flights that begin together, the temporal ensemble.
+    """Means of the chunks of B flights, the temporal ensemble.
 
     Of the predictions of an action, one that was made a time steps ago has a weight in proportion to
     exp(m a): 0 is the mean, a positive m as in ACT trusts the oldest most, a negative one the newest.
@@ -57,17 +57,21 @@ class Ensemble:
         self._between = np.maximum(0.0, 1.0 - np.abs(steps / spacing - np.arange(actions)))
         self._fade = np.exp(weighting)
         self._sums = np.zeros((flights, len(steps), inputs))
-        self._weights = np.zeros((len(steps), 1))
+        self._weights = np.zeros((flights, len(steps), 1))
+
+    def forget(self, flights: NDArray[np.bool_]) -> None:
+        """Begin some flights anew, those of a mask of shape (B,)."""
+        self._sums[flights], self._weights[flights] = 0.0, 0.0
 
     def add(self, chunks: FloatArray) -> FloatArray:
         """Add the chunks of this time step, shape (B, k, n_u); returns its actions, shape (B, n_u)."""
         self._sums *= self._fade
         self._sums += self._between @ chunks
         self._weights = self._fade * self._weights + 1.0
-        actions: FloatArray = self._sums[:, 0] / self._weights[0]
+        actions: FloatArray = self._sums[:, 0] / self._weights[:, 0]
         self._sums[:, :-1] = self._sums[:, 1:]
-        self._weights[:-1] = self._weights[1:]
-        self._sums[:, -1], self._weights[-1] = 0.0, 0.0
+        self._weights[:, :-1] = self._weights[:, 1:]
+        self._sums[:, -1], self._weights[:, -1] = 0.0, 0.0
         return actions
 
 
@@ -76,7 +80,7 @@ class ChunkingPolicy:
     """A transformer from observations to chunks of actions, with a memory: `action = policy(observation)`.
 
     It remembers the chunks of an episode: call `begin` when another one begins, as `rollout` does. All
-    flights of a batch begin together.
+    flights of a batch begin together, except by `predict`.
 
     Attributes:
         tensors: Weights by name, float32, see `tensor_shapes`.
@@ -165,7 +169,40 @@ class ChunkingPolicy:
                 f"observation: shape {seen.shape}, should be {(*self._flights, self.n_observation)} as "
                 "at the time step before; call begin() where other flights begin"
             )
-        return self._memory.add(chunks).reshape(*seen.shape[:-1], -1).astype(np.float32)
+        return self._memory.add(chunks).reshape(*seen.shape[:-1], self.n_action).astype(np.float32)
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[SingleArray, None]:
+        """Choose actions by the interface of Stable-Baselines3.
+
+        Args:
+            observation: Shape (n_obs,) or (B, n_obs).
+            state: None; the policy keeps its memory itself.
+            episode_start: Which episodes have just started, shape (B,): their chunks are forgotten. None for
+                none of them.
+            deterministic: Ignored; the policy is deterministic.
+
+        Returns:
+            Actions, shape (n_u,) or (B, n_u), and None.
+
+        Raises:
+            TypeError: If the observation is masked, or not of real numbers.
+            ValueError: If a shape does not fit, or B is not that of the flights that have begun.
+        """
+        if episode_start is not None:
+            started = np.atleast_1d(np.asarray(episode_start, np.bool_))
+            if started.shape != (wanted := np.shape(observation)[:-1] or (1,)):
+                raise ValueError(f"episode_start: shape {started.shape}, should be {wanted}")
+            if started.all():
+                self.begin()
+            elif self._memory is not None and wanted == (self._flights or (1,)):
+                self._memory.forget(started)
+        return self(observation), None
 
     def chunks(self, observation: NDArray[Any]) -> FloatArray:
         """Predict the actions to come, without the ensemble.
@@ -194,7 +231,7 @@ class ChunkingPolicy:
         # Rows of all tokens in one product: several times as fast as a stack of small ones.
         weight = self._doubles[f"{name}_weight_{i}"]
         product = values.reshape(-1, len(weight)) @ weight + self._doubles[f"{name}_bias_{i}"]
-        return product.reshape(*values.shape[:-1], -1)
+        return product.reshape(*values.shape[:-1], weight.shape[1])
 
     def _activated(self, values: FloatArray) -> FloatArray:
         ACTIVATIONS[self.activation](values, np.empty_like(values))
@@ -213,7 +250,9 @@ class ChunkingPolicy:
     def _attention(self, tokens: FloatArray, i: int) -> FloatArray:
         """Self-attention among the tokens of a chunk, shape (B, k, d)."""
         flights, length, width = tokens.shape
-        heads = self._linear(tokens, "attend_in", i).reshape(flights, length, 3, self.heads, -1)
+        heads = self._linear(tokens, "attend_in", i).reshape(
+            flights, length, 3, self.heads, width // self.heads
+        )
         query, key, value = heads.transpose(2, 0, 3, 1, 4)  # (B, heads, k, d / heads) each
         scores = query @ key.swapaxes(-1, -2) / np.sqrt(width // self.heads)
         scores = np.exp(scores - scores.max(axis=-1, keepdims=True))

@@ -110,6 +110,26 @@ def test_it_remembers_within_an_episode_and_forgets_at_the_next():
         policy(np.zeros(N_OBS + 1))
 
 
+def test_rows_that_start_an_episode_forget_their_chunks_alone():
+    policy, seen = ChunkingPolicy(**parts()), observations(12, 3)
+    starts = np.zeros((12, 3), bool)
+    starts[0] = starts[4, 1] = starts[7, 1] = starts[7, 2] = True
+    policy(observations(2))  # another batch, which the first step forgets
+    together = [policy.predict(*given) for given in zip(seen, [None] * 12, starts, strict=True)]
+    assert {state for _, state in together} == {None}
+    for i in range(3):
+        alone = []
+        for row, start in zip(seen[:, i], starts[:, i], strict=True):
+            alone.append(policy.predict(row, None, [start])[0])
+        np.testing.assert_allclose(alone, np.array([each for each, _ in together])[:, i], rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match=r"episode_start: shape \(2,\), should be \(1,\)"):
+        policy.predict(seen[0, 0], None, [True, False])
+
+
+def test_a_batch_may_be_empty():
+    assert ChunkingPolicy(**parts())(np.empty((0, N_OBS))).shape == (0, N_U)
+
+
 def test_every_rollout_begins_anew(small_scene):
     kernels = compile_scene(small_scene)
     n_obs = len(kernels.observation(kernels.layout.initial_state, [1.0])[0])
