@@ -20,6 +20,7 @@ this record alone, so that it cannot go stale or be embellished. The record (`<n
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import re
 import sys
@@ -36,13 +37,15 @@ from agents.evaluation.evaluation_verbs import progress_bar
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.training_runs import training_command
 from agents.policies import ExportedPolicy, PolicyFileError
+from agents.policies.policy_files import noted_effort
 from agents.zoo.finding import as_policy, check_fit, policy_path
-from agents.zoo.shelf import MOST_BYTES, SHELF, ZooError, file_hash, list_policies
+from agents.zoo.shelf import MOST_BYTES, SHELF, ZooError, list_policies
 from dq_space_arm_env import Scene, list_scenes, load_scene
 from dq_space_arm_env.command_line.verb_program import run_to_end
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.provenance import provenance
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.tables import TextTable
 from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations import DemonstrationsError
@@ -99,14 +102,16 @@ def add_to_zoo(
         for condition in ordered
     ]
     elsewhere = [evaluate(policy, other, n, label=chosen, expert=False).summary() for other in others]
+    record = _record(scene, content, command, evaluations)
+    told = [{key: summary[key] for key in _ELSEWHERE} for summary in elsewhere]
+    record |= {"elsewhere": _rounded(told)} if told else {}
+    # All are made before the first is written: a shelf has what belongs together.
+    text, described = json.dumps(record, indent=1, allow_nan=False) + "\n", card(chosen, policy, record)
     shelf.mkdir(parents=True, exist_ok=True)
     weights = shelf / f"{chosen}.npz"
     write_atomically(weights, content)  # as evaluated, even if the file changed since
-    record = _record(scene, weights, command, evaluations)
-    told = [{key: summary[key] for key in _ELSEWHERE} for summary in elsewhere]
-    record |= {"elsewhere": _rounded(told)} if told else {}
-    write_atomically(weights.with_suffix(".json"), json.dumps(record, indent=1, allow_nan=False) + "\n")
-    write_atomically(weights.with_suffix(".md"), card(chosen, policy, record))
+    write_atomically(weights.with_suffix(".json"), text)
+    write_atomically(weights.with_suffix(".md"), described)
     return weights.with_suffix(".md")
 
 
@@ -125,6 +130,7 @@ def _checked(policy: ExportedPolicy, file: Path, name: str, command: str | None,
             f"{file} does not follow from a configuration of the package, so nobody could reproduce it: put "
             "it into configs/agents under the agent's name, or give the command that trains it"
         )
+    _check_told(policy.metadata, file)
     others = sum((shelf / f"{other}.npz").stat().st_size for other in list_policies(shelf) if other != name)
     size = file.stat().st_size
     if others + size > MOST_BYTES:
@@ -135,14 +141,25 @@ def _checked(policy: ExportedPolicy, file: Path, name: str, command: str | None,
     return load_scene(scene)
 
 
-def _record(scene: Scene, weights: Path, command: str, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+def _check_told(metadata: Mapping[str, Any], file: Path) -> None:
+    """Refuse metadata that the card cannot tell."""
+    origin = metadata.get("provenance", {})
+    told = {"configuration": metadata.get("configuration", {}), "provenance": origin}
+    if isinstance(origin, Mapping):
+        told |= {f"provenance.{name}": origin.get(name) or {} for name in ("commit", "versions")}
+    for name, value in told.items():
+        if not isinstance(value, Mapping):
+            raise ZooError(f"{file}: metadata: {name}: {shortened(value)}, should be a mapping, or left out")
+
+
+def _record(scene: Scene, content: bytes, command: str, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     first, origin = evaluations[0], provenance()
     return {
         "scene": scene.name,
         "physics": physics_hash(scene),
         "success": scene.success.model_dump(),
-        "sha256": file_hash(weights),
-        "bytes": weights.stat().st_size,
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "bytes": len(content),
         "training_command": command,
         "trained_here": first.same_scene,
         "evaluations": [_rounded(evaluation.summary()) for evaluation in evaluations],
@@ -236,7 +253,7 @@ def card(name: str, policy: ExportedPolicy, record: Mapping[str, Any]) -> str:
         scene=record["scene"],
         facts="\n\n".join(_facts(policy, record).markdown()),
         training=record["training_command"],
-        effort=_effort(metadata.get("training", {})),
+        effort=_effort(noted_effort(metadata)),
         configuration=dump_yaml(dict(configuration), "").strip(),
         evaluation="\n\n".join(_table(record).markdown()),
         angle=f"{success['attitude_error_deg']:g}",
@@ -267,7 +284,7 @@ def _facts(policy: ExportedPolicy, record: Mapping[str, Any]) -> TextTable:
 
 def _trained_with(origin: Mapping[str, Any]) -> dict[str, str]:
     names = ("sb3-contrib", "stable-baselines3", "torch")
-    versions = origin.get("versions", {})
+    versions = origin.get("versions") or {}
     return {name: versions[name] for name in names if versions.get(name)}
 
 

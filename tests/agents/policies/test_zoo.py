@@ -137,6 +137,10 @@ def test_what_does_not_belong_into_the_zoo_is_refused(shipped, tmp_path, monkeyp
     monkeypatch.setattr("scripts.add_to_zoo.evaluate", lambda *given, **options: pytest.fail("flies"))
     with pytest.raises(ValueError, match="condition: 'rain' is unknown"):
         add_to_zoo(run, training="x", conditions=["spin", "rain"], shelf=shelf)
+    for name, value in {"configuration": "mine", "provenance": {"versions": ["torch"]}}.items():
+        vague = write_policy(tmp_path / name, **{name: value})
+        with pytest.raises(ZooError, match=rf"metadata: {name}.*, should be a mapping, or left out"):
+            add_to_zoo(vague, training="x", shelf=shelf)
     found = {"quick": QUICK}
     monkeypatch.setattr("scripts.add_to_zoo.load_scene", lambda name: found.get(name) or load_scene(name))
     with pytest.raises(SceneError, match="no-such-scene"):
@@ -147,6 +151,21 @@ def test_what_does_not_belong_into_the_zoo_is_refused(shipped, tmp_path, monkeyp
     with pytest.raises(ZooError, match="together they should be at most 100"):
         add_to_zoo(run, training="x", shelf=shelf)
     assert not shelf.exists()
+
+
+def test_what_fails_after_the_flights_leaves_the_shelf_as_it_was(shipped, tmp_path, monkeypatch):
+    def fails(*given):
+        raise ValueError("no card")
+
+    monkeypatch.setattr("scripts.add_to_zoo.card", fails)
+    run, shelf = write_policy(tmp_path / "run", training="little"), tmp_path / "shelf"
+    with pytest.raises(ValueError, match="no card"):
+        add_to_zoo(run, n=1, conditions=(), training="x", shelf=shelf, executor=SerialExecutor())
+    assert not shelf.exists()
+    monkeypatch.undo()
+    assert "The training effort was not recorded." in card(
+        "stub", ExportedPolicy.load(run / "policy.npz"), load_record("ppo")
+    )
 
 
 def test_the_script_adds_a_policy(shipped, tmp_path, capsys):
