@@ -58,7 +58,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
     episode ends are those of `DQSpaceArmEnv`. Entries of `info` are arrays of shape (num_envs,), each with a
     mask of the same name preceded by an underscore (read-only where True everywhere). `reset(seed=s)` seeds
     sub-environment i with s + i; a list gives each its own seed. `options` may hold "reset_mask", a bool
-    array of shape (num_envs,), to reset only some; "initial_state", "target" and "parameters" may have a row
+    array of shape (num_envs,), to reset only some; those that the first reset leaves out wait at the scene's
+    own start, as if their episodes were over. "initial_state", "target" and "parameters" may have a row
     per sub-environment, shapes (num_envs, n_x), (num_envs, 8) and (num_envs, n_p). Actions in float32, the
     type of the action space, are used without a copy.
 
@@ -215,9 +216,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
         saved = saved_state(rest)
         if saved is None:
-            starts = self._given_starts(rows, rest)
+            starts, first = self._given_starts(rows, rest), not self._begun
             self._seed(seed, rows)
             self._envs.begin(rows, starts)
+            if first and len(others):
+                self._envs.begin(others, given_start(self.kernels, {"nominal": True}))
+                self._remember(self.observe())
             self._over = np.setdiff1d(self._over, rows)
             self._begin_trails(rows)
             self._extend_trails()
