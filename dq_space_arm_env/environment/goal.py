@@ -215,13 +215,18 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
         """Go on where `get_state` was called, see `DQSpaceArmEnv.set_state`.
 
         Args:
-            state: What `get_state` returned, arrays of its shapes.
+            state: What `get_state` returned, arrays of its shapes, or a row of a vector environment's.
 
         Raises:
             ValueError: If an array is missing, has another shape or type, or is not finite.
         """
-        expected = {"truncated": np.array(True)}
-        truncated = checked_state(state, expected, self.scene.simulation.steps)["truncated"]
+        expected, given = {"truncated": np.array(True)}, state
+        if isinstance(state, Mapping) and "over" in state:
+            given = {
+                "truncated": state["over"],
+                **state,
+            }  # vector environments keep it once: nothing else ends
+        truncated = checked_state(given, expected, self.scene.simulation.steps)["truncated"]
         self._env.set_state(state)
         self.np_random, self._truncated = self._env.np_random, bool(truncated)
 

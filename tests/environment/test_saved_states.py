@@ -146,6 +146,23 @@ def test_an_episode_branches_into_copies(mode):
         assert branch.step(action)[1] == rewards[i]
 
 
+@pytest.mark.parametrize("steps", [5, LENGTH])
+@pytest.mark.parametrize(
+    "kinds", [(DQSpaceArmEnv, DQSpaceArmVectorEnv), (DQSpaceArmGoalEnv, DQSpaceArmGoalVectorEnv)]
+)
+def test_an_episode_goes_on_alone(kinds, steps):
+    env, venv = kinds[0](DRAWN), kinds[1](3, DRAWN, autoreset_mode="Disabled")
+    venv.reset(seed=[1, 2, 3])
+    for move in actions((steps, 3, 12)):
+        venv.step(move)
+    env.set_state({name: array[1] for name, array in venv.get_state().items()})
+    over = {"over": np.array(steps == LENGTH)}
+    over |= {"truncated": over["over"]} if kinds[0] is DQSpaceArmGoalEnv else {}
+    assert_same({name: env.get_state()[name] for name in over}, over)
+    if steps < LENGTH:
+        assert env.step(move[1])[1] == venv.step(move)[1][1]
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("rows", [[2, 0], np.array([True, False, True])])
 def test_rows_are_saved_and_put_back(mode, rows):
