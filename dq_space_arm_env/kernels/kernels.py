@@ -121,7 +121,8 @@ class Kernels(DerivativeKernels):
             states: States at the ends of time steps, the start first, shape (N + 1, n_x) or (N + 1, B, n_x).
             u: Inputs held during the steps, shape (N, n_u) or (N, B, n_u), units of `layout.control`; of a
                 flight in the environment what acted, see `applied_inputs`. A catch is taken to hold.
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+            p: Parameters, shape (n_p,), or (B, n_p) of B motions, units of `parameters`; nominal ones by
+                default.
 
         Returns:
             Distance [m] or angle [rad] between the tips of both, the largest, shape (N + 1,) or (N + 1, B);

@@ -179,7 +179,9 @@ class KernelLibrary:
             results = single.results(inputs if p is None else {**inputs, "parameters": p})
             if results is not None:
                 return results
-        rows, batched, arrays = rows_of(inputs if p is None else {**inputs, "p": p}, self.dtype)
+        if p is not None:
+            inputs = {**inputs, "p": self._checked_parameters(p)}
+        rows, batched, arrays = rows_of(inputs, self.dtype)
         arrays = {**self._defaults, **arrays, "parameters": self.parameter_rows(arrays.get("p"), rows)}
         kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
         ordered = []
@@ -204,13 +206,19 @@ class KernelLibrary:
 
         Raises ValueError for another shape.
         """
-        given = self._defaults["parameters"] if p is None else real_array("p", p, self.dtype)
-        if given.shape not in ((self.n_p,), (rows, self.n_p)):
-            raise ValueError(
-                f"p: shape {given.shape}, should be ({self.n_p},) or ({rows}, {self.n_p}); the parameters of "
-                f"scene {self.scene.name!r} are {', '.join(self.parameters.names) or 'none'}"
-            )
+        given = self._defaults["parameters"] if p is None else self._checked_parameters(p, rows)
         return np.broadcast_to(given, (rows, self.n_p))
+
+    def _checked_parameters(self, p: ArrayLike, rows: int | None = None) -> Array:
+        """Parameters of shape (n_p,) or (rows, n_p), or of any number of rows; ValueError for another."""
+        given = real_array("p", p, self.dtype)
+        batch = (len(given) if rows is None and given.ndim == 2 else rows, self.n_p)
+        if given.shape not in ((self.n_p,), batch):
+            raise ValueError(
+                f"p: shape {given.shape}, should be ({self.n_p},) or ({rows or 'B'}, {self.n_p}); the "
+                f"parameters of scene {self.scene.name!r} are {', '.join(self.parameters.names) or 'none'}"
+            )
+        return given
 
 
 def compile_program(program: Program, lanes: int) -> BoundKernel:

@@ -41,6 +41,9 @@ def numerical_error(finer: RobotKernels, states: ArrayLike, u: ArrayLike, p: Arr
             f"states, u: shapes {motion.shape} and {controls.shape}, should be (N + 1, n_x) and (N, n_u), or "
             "(N + 1, B, n_x) and (N, B, n_u)"
         )
+    shapes = {(finer.n_p,): None, (*controls.shape[1:-1], finer.n_p): None}
+    if p is not None and np.shape(p) not in shapes:
+        raise ValueError(f"p: shape {np.shape(p)}, should be {' or '.join(map(str, shapes))}")
     x, errors = motion[0].astype(np.float64), np.zeros(motion.shape[:-1])
     stages = _stages(finer, p)
     if stages is not None and len(controls) >= len(stages):

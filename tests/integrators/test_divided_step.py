@@ -129,3 +129,7 @@ def test_the_numerical_error_is_that_of_the_motion(scene):
     np.testing.assert_allclose(both, np.stack([errors, errors], axis=1), rtol=1e-6)
     with pytest.raises(ValueError, match=r"states, u: shapes \(16, .*\) and \(16"):
         coarse.numerical_error(np.array(motion[1:]), u)
+    n_p = coarse.n_p
+    np.testing.assert_array_equal(coarse.numerical_error(np.array(motion), u, np.empty(n_p)), errors)
+    with pytest.raises(ValueError, match=rf"p: shape \(2, {n_p}\), should be \({n_p},\)$"):
+        coarse.numerical_error(np.array(motion), u, np.empty((2, n_p)))

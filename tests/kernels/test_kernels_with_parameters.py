@@ -150,6 +150,15 @@ def test_parameters_of_another_shape_are_refused(twins, p):
         kernels.simulate(x[0], u, 5, p=p)
 
 
+def test_the_shape_that_is_refused_is_the_given_one():
+    kernels = compile_scene("planar")
+    x, u = kernels.layout.initial_state, np.zeros(kernels.n_u)
+    with pytest.raises(ValueError, match=r"p: shape \(1,\), should be \(0,\) or \(B, 0\); the parameters"):
+        kernels.step(x, u, p=[1.0])
+    with pytest.raises(ValueError, match=r"p: shape \(20, 1\), should be \(0,\) or \(B, 0\)"):
+        kernels.step(x, u, p=np.ones((20, 1)))
+
+
 def test_a_scene_of_constants_takes_none():
     kernels = compile_scene("planar")
     x, u = moving(kernels, 1)
