@@ -15,6 +15,11 @@ ArrayT = TypeVar("ArrayT")
 
 FIRST_ONLY = "the kernels have first derivatives only: for second ones take jax_dynamics without kernels"
 """Refusal of derivatives of the kernels' products."""
+NO_FORWARD_MODE = (
+    "the kernels have no derivatives in forward mode: take reverse mode, such as jacrev, or jax_dynamics "
+    "without kernels"
+)
+"""Refusal of tangents."""
 
 
 class DifferentiableDynamics(ABC, Generic[ArrayT]):
@@ -126,7 +131,8 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
         """Take N steps in a row, and keep their states and costs.
 
         Its gradient needs the states that it returns, and nothing else: with `every` above 1 the steps
-        between them are taken again, for a share of 1 / `every` of the memory.
+        between them are taken again, for a share of 1 / `every` of the memory. The tip is taken to hold what
+        it catches, wherever it is: an episode's catch may miss.
 
         Args:
             x: States at the start, shape (n_x,) or (B, n_x), units of `layout.state`.

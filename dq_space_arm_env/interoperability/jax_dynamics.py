@@ -49,6 +49,9 @@ class _ByXLA(JaxDynamics):
         super().__init__(scene, integrator, dt)
         self._functions, self._compiled = self._emit(), cache(self._compile)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _ByXLA, (self.scene, self.integrator, self.dt)
+
     def _emit(self) -> dict[str, Function]:
         from dq_space_arm_env.interoperability.traced_functions import step_of_fixed_stages
         from dq_space_arm_env.interoperability.xla_functions import xla_function
@@ -106,8 +109,12 @@ class _ByKernels(JaxDynamics):
     ) -> None:
         kernels = compile_scene(scene, threads)
         super().__init__(kernels.scene, integrator, dt)
+        self._threads = threads
         self._operations = DifferentiableKernels(kernels, self.integrator, self.dt)
         self._calling = cache(self._call)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _ByKernels, (self.scene, self.integrator, self.dt, self._threads)
 
     def _run(self, name: str, arrays: list[Any], every: int = 1) -> tuple[Any, ...]:
         results: tuple[Any, ...] = self._calling(name, self._shapes(name, arrays, every), every)(*arrays)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dq_space_arm_env.interoperability.differentiable_dynamics import FIRST_ONLY, DifferentiableDynamics
+from dq_space_arm_env.interoperability.differentiable_dynamics import (
+    FIRST_ONLY,
+    NO_FORWARD_MODE,
+    DifferentiableDynamics,
+)
 from dq_space_arm_env.interoperability.differentiable_kernels import DifferentiableKernels
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene
@@ -25,10 +29,15 @@ class TorchDynamics(DifferentiableDynamics["Tensor"]):
         """See `torch_dynamics`."""
         self._torch, kernels = _torch(), compile_scene(scene, threads)
         super().__init__(kernels.scene, integrator, dt)
-        self._kernels = DifferentiableKernels(kernels, self.integrator, self.dt)
+        self._threads, self._kernels = threads, DifferentiableKernels(kernels, self.integrator, self.dt)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return torch_dynamics, (self.scene, self.integrator, self.dt, self._threads)
 
     def _checked(self, name: str, array: Any) -> Tensor:
-        tensor, wanted = self._torch.as_tensor(array), getattr(self._torch, self._dtype.name)
+        torch, wanted = self._torch, getattr(self._torch, self._dtype.name)
+        # A tensor that shares an array's memory would not tell backward() that the array has changed.
+        tensor = array if isinstance(array, torch.Tensor) else torch.tensor(array)
         if tensor.device.type != "cpu":
             raise ValueError(f"{name}: on device {tensor.device}, the kernels run on the CPU: move it there")
         if tensor.dtype != wanted:
@@ -54,7 +63,8 @@ def torch_dynamics(
     """Make a scene's kernels differentiable functions of PyTorch, on the CPU.
 
     The gradients are those of the kernels, by reverse mode, also by the parameters, but for those of
-    constraints, which are refused. There are first derivatives only: differentiating them again is refused.
+    constraints, which are refused. There are first derivatives only: differentiating them again is refused,
+    and so is forward mode. `torch.func.vmap` and `jacrev` take all calls that they map in one.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file.
@@ -86,7 +96,23 @@ def _function() -> Any:
     base: Any = torch.autograd.Function
 
     def arrays(tensors: Any) -> list[Any]:
-        return [tensor.detach().numpy() for tensor in tensors]
+        try:
+            return [tensor.detach().numpy() for tensor in tensors]
+        except RuntimeError as error:  # PyTorch's older vmap, which knows no functions but its own
+            raise NotImplementedError(
+                "the kernels need the numbers of tensors, which autograd's jacobian(..., vectorize=True) and "
+                "grad(..., is_grads_batched=True) do not give: take torch.func.jacrev"
+            ) from error
+
+    def on_rows(apply: Any, size: int, dims: Any, tensors: Any) -> Any:
+        """Run a function of rows on tensors mapped along some dimensions: theirs and its own as one."""
+        spread = [
+            each.expand(size, *each.shape) if dim is None else each.movedim(dim, 0)
+            for each, dim in zip(tensors, dims, strict=True)
+        ]
+        results = apply(*(each.flatten(0, 1) for each in spread))
+        rows = size, spread[0].shape[1]
+        return tuple(each.reshape(*rows, *each.shape[1:]) for each in results), (0,) * len(results)
 
     class Value(base):  # type: ignore[misc]
         @staticmethod
@@ -103,6 +129,14 @@ def _function() -> Any:
             wanted = ctx.needs_input_grad[-1]
             return None, *Products.apply(ctx.operation, wanted, *ctx.saved_tensors, *cotangents)
 
+        @staticmethod
+        def jvp(ctx: Any, *tangents: Any) -> Any:
+            raise NotImplementedError(NO_FORWARD_MODE)
+
+        @staticmethod
+        def vmap(info: Any, dims: Any, operation: Any, *inputs: Any) -> Any:
+            return on_rows(partial(Value.apply, operation), info.batch_size, dims[1:], inputs)
+
     class Products(base):  # type: ignore[misc]
         @staticmethod
         def forward(operation: Any, wanted: bool, *tensors: Any) -> Any:
@@ -118,5 +152,11 @@ def _function() -> Any:
         @staticmethod
         def backward(ctx: Any, *cotangents: Any) -> Any:
             raise NotImplementedError(FIRST_ONLY)
+
+        jvp = backward
+
+        @staticmethod
+        def vmap(info: Any, dims: Any, operation: Any, wanted: bool, *tensors: Any) -> Any:
+            return on_rows(partial(Products.apply, operation, wanted), info.batch_size, dims[2:], tensors)
 
     return Value

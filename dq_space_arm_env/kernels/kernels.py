@@ -47,6 +47,9 @@ class Kernels(DerivativeKernels):
         n_p: Number of parameters.
     """
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return compile_scene, (self.scene, self.threads)
+
     def step(
         self,
         x: ArrayLike,

@@ -1,6 +1,8 @@
 """Scenes as functions of PyTorch and JAX: against the kernels, chains of steps, and finite differences."""
 
+import copy
 import os
+import pickle
 import subprocess
 import sys
 
@@ -204,6 +206,66 @@ def test_misuse_of_tensors_is_named(torch):
         (by_u.sum() + u.sum()).backward()
 
 
+def test_maps_and_jacobians_are_those_of_single_calls(torch):
+    kernels, states, inputs, p = moving("planar")
+    x, u, p = torch.tensor(states), torch.tensor(inputs), torch.tensor(p)
+    dynamics, func = torch_dynamics("planar"), torch.func
+    for i, found in enumerate(func.vmap(dynamics.step, (None, 1, None))(x[0], u[:2], p)):
+        np.testing.assert_array_equal(found, dynamics.step(x[0], u[:2, i], p))
+    rows = []
+    for entry in range(kernels.n_x):
+        given = [each.clone().requires_grad_() for each in (x, u[0], p)]
+        rows.append(torch.autograd.grad(dynamics.step(*given)[:, entry].sum(), given[:2]))
+    found = func.vmap(func.jacrev(dynamics.step, (0, 1)), (0, 0, None))(x, u[0], p)
+    for part, expected in zip(found, zip(*rows, strict=True), strict=True):
+        np.testing.assert_allclose(part, torch.stack(expected, 1), rtol=1e-12, atol=1e-12)
+
+    def cost(x, u):
+        return dynamics.rollout(x, u, p, every=2)[1].sum()
+
+    given = u.clone().requires_grad_()
+    (by_u,) = torch.autograd.grad(cost(x, given), given)
+    np.testing.assert_allclose(func.vmap(func.grad(cost, 1), (0, 1), 1)(x, u), by_u, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:FutureWarning")  # PyTorch's own
+def test_derivatives_that_kernels_lack_are_refused_by_name(torch):
+    dynamics = torch_dynamics("planar")
+    _, states, inputs, _ = moving("planar")
+    x, u = torch.tensor(states[0]), torch.tensor(inputs[0, 0])
+    with pytest.raises(NotImplementedError, match="no derivatives in forward mode: take reverse mode"):
+        torch.func.jacfwd(dynamics.step, 1)(x, u)
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        torch.func.jacrev(torch.func.jacrev(dynamics.cost, 1), 1)(x, u)
+    with pytest.raises(NotImplementedError, match=r"vectorize=True.*: take torch\.func\.jacrev"):
+        torch.autograd.functional.jacobian(lambda u: dynamics.step(x, u), u, vectorize=True)
+
+
+def test_arrays_may_change_before_the_gradient(torch):
+    dynamics = torch_dynamics("planar")
+    _, states, inputs, _ = moving("planar")
+    gradients = []
+    for change in (0.0, 1.0):
+        x, u = states.copy(), torch.tensor(inputs[0], requires_grad=True)
+        total = dynamics.step(x, u).sum()
+        x += change
+        gradients += torch.autograd.grad(total, u)
+    np.testing.assert_array_equal(*gradients)
+
+
+def test_modules_that_hold_dynamics_are_copied_and_saved(torch, tmp_path):
+    class Model(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.dynamics = torch_dynamics("planar", "rk8", dt=0.03, threads=2)
+
+    model = Model()
+    torch.save(model.dynamics, tmp_path / "dynamics.pt")
+    x, u = (each[0] for each in moving("planar")[1:3])
+    for each in (copy.deepcopy(model).dynamics, torch.load(tmp_path / "dynamics.pt", weights_only=False)):
+        np.testing.assert_array_equal(each.step(x, u[0]), model.dynamics.step(x, u[0]))
+
+
 def test_single_precision(torch):
     scene = load_scene("planar").replace(simulation={"precision": "float32"})
     _, states, inputs, _ = moving(scene)
@@ -332,6 +394,14 @@ def test_second_derivatives_of_kernels_are_refused(jax, short_scene):
         jax.grad(lambda u: jax.grad(lambda u: dynamics.cost(x, u))(u).sum())(u)
     with pytest.raises(TypeError, match="forward-mode"):
         jax.jvp(lambda u: dynamics.step(x, u), (u,), (u,))
+
+
+@pytest.mark.parametrize("kernels", [False, True])
+def test_dynamics_in_jax_are_copied(kernels, jax, short_scene):
+    dynamics = jax_dynamics(short_scene, "symplectic_euler", dt=0.03, kernels=kernels)
+    for copied in (copy.deepcopy(dynamics), pickle.loads(pickle.dumps(dynamics))):
+        assert type(copied) is type(dynamics)
+        assert (copied.scene, copied.integrator, copied.dt) == (short_scene, "symplectic_euler", 0.03)
 
 
 def test_kernels_take_every_integrator(jax):

@@ -1,6 +1,8 @@
 """What a caller of the kernels sees: shapes, errors, bit equality, and how much each scene needs."""
 
+import copy
 import gc
+import pickle
 import weakref
 
 import numpy as np
@@ -102,6 +104,12 @@ def test_a_call_of_one_row_keeps_its_arrays_alive(draw):
 
 def test_the_same_scene_gives_the_same_kernels():
     assert compile_scene("paper") is compile_scene(load_scene("paper"))
+
+
+def test_copies_of_kernels_are_the_same_kernels():
+    kernels = compile_scene("planar", threads=2)
+    assert copy.deepcopy(kernels) is kernels
+    assert pickle.loads(pickle.dumps(kernels)) is kernels
 
 
 def test_difference_and_retraction_are_inverse(draw):
