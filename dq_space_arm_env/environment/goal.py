@@ -220,12 +220,11 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
         Raises:
             ValueError: If an array is missing, has another shape or type, or is not finite.
         """
-        expected, given = {"truncated": np.array(True)}, state
-        if isinstance(state, Mapping) and "over" in state:
-            given = {
-                "truncated": state["over"],
-                **state,
-            }  # vector environments keep it once: nothing else ends
+        given, expected = state, {"truncated": np.array(True)}
+        if (
+            isinstance(state, Mapping) and "over" in state
+        ):  # all that vector environments keep: nothing else ends
+            given = {"truncated": state["over"], **state}
         truncated = checked_state(given, expected, self.scene.simulation.steps)["truncated"]
         self._env.set_state(state)
         self.np_random, self._truncated = self._env.np_random, bool(truncated)
