@@ -31,6 +31,7 @@ _EARTH_CENTER, _EARTH_RADIUS, _AIR_HEIGHT = (0.62, 3.02), 2.16, 0.020
 _AIR, _SEA = np.array((70.0, 128.0, 205.0)), np.array((9.0, 26.0, 58.0))
 _STARS_PER_PIXEL = 6e-4
 _STARS_SEED = 2018
+_BAND = 1 << 16  # pixels of the sky that are painted at a time
 
 
 def mesh_faces(mesh: Mesh, rotations: Array, positions: Array, camera: Camera) -> Faces:
@@ -120,23 +121,32 @@ def trail_faces(trail: Array, camera: Camera) -> Faces:
 def paint_sky(width: int, height: int) -> Image:
     """Stars, and the Earth's limb below: the same for every picture of a size."""
     rng = np.random.default_rng(_STARS_SEED)
-    down = np.linspace(0.0, 1.0, height)[:, None, None]
-    sky = np.repeat(_SKY_TOP + down * (_SKY_BOTTOM - _SKY_TOP), width, axis=1)
     count = round(_STARS_PER_PIXEL * width * height)
     rows, columns = rng.integers(height, size=count), rng.integers(width, size=count)
     brightness = 25.0 + 200.0 * rng.random(count) ** 5
     tint = 1.0 + rng.uniform(-0.12, 0.12, (count, 1)) * np.array((1.0, 0.0, -1.0))
-    sky[rows, columns] += brightness[:, None] * tint
-    # Distance from the Earth's limb, of the picture's height, positive outside.
-    y, x = np.mgrid[:height, :width] / height
-    above = (np.hypot(x - _EARTH_CENTER[0] * width / height, y - _EARTH_CENTER[1]) - _EARTH_RADIUS)[..., None]
-    day = np.clip(1.15 - 0.85 * x[..., None] * height / width, 0.0, 1.0)
-    inside = np.maximum(-above, 0.0)
-    earth = day * (_AIR * 0.62 * np.exp(-inside / 0.05) + _SEA)
-    air = day * _AIR * np.exp(-np.maximum(above, 0.0) / _AIR_HEIGHT)
-    cover = np.clip(0.5 - above * height, 0.0, 1.0)
-    sky = (1.0 - cover) * (sky + air) + cover * earth
-    # Noise of half a step hides the banding of so slow a gradient.
-    noisy = np.floor(sky + rng.random((height, width, 1)))
-    picture: Image = np.clip(noisy, 0.0, 255.0).astype(np.uint8)
+    stars = brightness[:, None] * tint
+    down = np.linspace(0.0, 1.0, height)[:, None, None]
+    x = np.arange(width) / height
+    day = np.clip(1.15 - 0.85 * x[:, None] * height / width, 0.0, 1.0)
+    picture: Image = np.empty((height, width, 3), dtype=np.uint8)
+    # In bands, as its numbers take fifty times the memory of the picture.
+    step = max(1, _BAND // width)
+    for top in range(0, height, step):
+        band = slice(top, min(top + step, height))
+        sky = np.repeat(_SKY_TOP + down[band] * (_SKY_BOTTOM - _SKY_TOP), width, axis=1)
+        own = (rows >= band.start) & (rows < band.stop)
+        sky[rows[own] - top, columns[own]] += stars[own]
+        # Distance from the Earth's limb, of the picture's height, positive outside.
+        y = np.arange(band.start, band.stop)[:, None] / height
+        above = np.hypot(x - _EARTH_CENTER[0] * width / height, y - _EARTH_CENTER[1]) - _EARTH_RADIUS
+        above = above[..., None]
+        inside = np.maximum(-above, 0.0)
+        earth = day * (_AIR * 0.62 * np.exp(-inside / 0.05) + _SEA)
+        air = day * _AIR * np.exp(-np.maximum(above, 0.0) / _AIR_HEIGHT)
+        cover = np.clip(0.5 - above * height, 0.0, 1.0)
+        sky = (1.0 - cover) * (sky + air) + cover * earth
+        # Noise of half a step hides the banding of so slow a gradient.
+        noisy = np.floor(sky + rng.random((len(sky), width, 1)))
+        picture[band] = np.clip(noisy, 0.0, 255.0)
     return picture
