@@ -14,6 +14,8 @@ from dq_space_arm_env.common.real_arrays import real_array
 
 LARGEST = 8192
 """Largest width and height, pixels: guards against typos that would fill the memory."""
+FARTHEST = 1e6
+"""Largest distance and coordinate of a camera, m: farther away no state of an episode is valid."""
 
 
 class View(NamedTuple):
@@ -48,6 +50,8 @@ class View(NamedTuple):
                 raise ValueError(f"default_camera_config: {key} {value!r}, should be {kind}")
             if key == "distance" and not array > 0.0:
                 raise ValueError(f"default_camera_config: distance {value!r}, should be positive, m")
+            if key in ("distance", "lookat") and np.abs(array).max() > FARTHEST:
+                raise ValueError(f"default_camera_config: {key} {value!r}, should be at most {FARTHEST:g} m")
             values[key] = tuple(array.tolist()) if shape else float(array)
         return cls(**values)
 

@@ -2,6 +2,7 @@
 
 import itertools
 import sys
+import tracemalloc
 
 import gymnasium
 import numpy as np
@@ -13,6 +14,7 @@ from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.scene import Scene, list_scenes, load_scene
 from dq_space_arm_env.viewing.picture_format import PictureFormat, View
 from dq_space_arm_env.viewing.rendering import Renderer
+from dq_space_arm_env.viewing.rendering.drawing import paint_sky
 from dq_space_arm_env.viewing.rendering.spacecraft import LINK
 
 NO_TRAIL = np.zeros((0, 3))
@@ -230,12 +232,22 @@ def test_wrong_shapes_are_refused(paper):
         ({"default_camera_config": {"elevation": np.inf}}, "elevation inf, should be a finite number"),
         ({"default_camera_config": {"azimuth": "90"}}, "azimuth '90', should be a finite number"),
         ({"default_camera_config": {"distance": 0}}, "distance 0, should be positive, m"),
+        ({"default_camera_config": {"distance": 1e308}}, r"distance 1e\+308, should be at most 1e\+06 m"),
+        ({"default_camera_config": {"lookat": (0, -2e6, 0)}}, r"-2000000.0, 0\), should be at most"),
         ({"default_camera_config": {"lookat": (1, 2)}}, r"lookat \(1, 2\), should be 3 finite numbers, m"),
     ],
 )
 def test_impossible_pictures_are_refused(arguments, sentence):
     with pytest.raises(ValueError, match=sentence):
         DQSpaceArmEnv(**arguments)
+
+
+def test_sky_takes_little_more_memory_than_its_picture():
+    tracemalloc.start()
+    picture = paint_sky(1024, 1024)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10 * picture.nbytes, "painted at once, it takes sixty times the memory"
 
 
 def test_pictures_need_no_pygame_and_a_window_says_what_it_needs(paper, monkeypatch):

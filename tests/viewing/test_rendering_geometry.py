@@ -273,17 +273,46 @@ def test_equivalent_box_has_the_inertia(edges, density, seed):
 # Camera ---------------------------------------------------------------------------------------------------
 
 
+def extent(camera, centers, radii, rng):
+    """Lower and upper corner in the picture of what balls cover, pixels."""
+    directions = rng.normal(size=(20000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = camera.project((centers[:, None] + radii[:, None, None] * directions).reshape(-1, 3))
+    return seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_camera_has_all_balls_in_view_and_no_farther_than_needed(seed):
     rng = np.random.default_rng(seed)
     centers, radii = rng.normal(size=(4, 3)) * 3.0, rng.uniform(0.1, 2.0, 4)
     view = View(azimuth=rng.uniform(-180.0, 180.0), elevation=rng.uniform(-85.0, 85.0))
-    camera = camera_around(centers, radii, view, 640, 480)
-    directions = rng.normal(size=(20000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    seen = camera.project((centers[:, None] + radii[:, None, None] * directions).reshape(-1, 3))
-    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+    low, high = extent(camera_around(centers, radii, view, 640, 480), centers, radii, rng)
     assert (low > -1e-6).all()
     assert (high < (640 + 1e-6, 480 + 1e-6)).all()
     used = (high - low) / (640, 480)
     assert used.max() > 0.98, f"the balls use only {used} of the picture"
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_camera_aimed_at_a_point_has_all_balls_in_view_and_no_farther_than_needed(seed):
+    rng = np.random.default_rng(seed)
+    centers, radii = rng.normal(size=(4, 3)) * 3.0, rng.uniform(0.1, 2.0, 4)
+    point = rng.normal(size=3) * 6.0
+    view = View(rng.uniform(-180.0, 180.0), rng.uniform(-85.0, 85.0), lookat=tuple(point))
+    camera = camera_around(centers, radii, view, 640, 480)
+    np.testing.assert_allclose(camera.project(point)[:2], (320.0, 240.0), rtol=0, atol=1e-6)
+    # The point is a ball too, so that the camera stays before it.
+    shown = np.vstack([centers, point]), np.append(radii, radii.min())
+    low, high = extent(camera, *shown, rng)
+    assert (low > -1e-6).all()
+    assert (high < (640 + 1e-6, 480 + 1e-6)).all()
+    margin = np.concatenate([low, (640, 480) - high]).min()
+    assert margin < 8.0, f"there are {margin:.1f} pixels left on all sides"
+
+
+def test_camera_aimed_past_what_it_shows_backs_away():
+    view = View(azimuth=0.0, elevation=0.0, lookat=(0.0, 50.0, 0.0))
+    camera = camera_around([(0.0, 0.0, 0.0)], [1.0], view, 640, 480)
+    assert 0.0 < camera.project(np.zeros(3))[0] < 640.0
+    behind = camera_around([(0.0, 0.0, 0.0)], [1.0], view._replace(lookat=(-50.0, 0.0, 0.0)), 640, 480)
+    assert behind.position[0] < -51.0, "the point is before the camera"

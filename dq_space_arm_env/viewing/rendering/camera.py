@@ -57,8 +57,9 @@ def camera_around(
     """Place a camera that looks in a given direction as close as possible with all balls in view.
 
     Balls have centers (balls, 3) and radii (balls,), m, in the inertial frame. The view has an azimuth and an
-    elevation; its point and distance, where given, take precedence over the balls. `field_of_view` is the
-    angle between the lower and the upper edge of the picture, rad.
+    elevation; its point and distance, where given, take precedence over the balls: a camera aimed at a point
+    moves back until all are in view. `field_of_view` is the angle between the lower and the upper edge of the
+    picture, rad.
     """
     if view.azimuth is None or view.elevation is None:
         raise ValueError(f"view: {view}, should have azimuth and elevation, deg")
@@ -69,19 +70,25 @@ def camera_around(
     axes = np.array([right, np.cross(forward, right), forward])
     balls = np.asarray(centers, dtype=np.float64) @ axes.T
     focal_length = 0.5 * height / math.tan(0.5 * field_of_view)
-    position = _closest(balls, np.asarray(radii, dtype=np.float64), width, height, focal_length)
-    distance = view.distance
-    if distance is None:
-        distance = float(balls[:, 2].mean() - position[2])
-    if view.lookat is not None:
-        position = axes @ np.array(view.lookat) - (0.0, 0.0, distance)
-    elif view.distance is not None:
-        position[2] = balls[:, 2].mean() - distance
+    sizes = np.asarray(radii, dtype=np.float64)
+    if view.lookat is None:
+        position = _closest(balls, sizes, width, height, focal_length)
+        depth = balls[:, 2].mean()
+    else:
+        point = axes @ np.array(view.lookat)
+        depth = point[2]
+        # A ball about the point itself, which the camera must not pass.
+        balls, sizes = np.vstack([balls, point]), np.append(sizes, sizes.min())
+        position = _closest(balls, sizes, width, height, focal_length, point)
+    if view.distance is not None:
+        position[2] = depth - view.distance
     return Camera(position @ axes, axes, focal_length, width, height)
 
 
-def _closest(balls: Array, radii: Array, width: int, height: int, focal_length: float) -> Array:
-    """Closest position, in the camera's own axes, with all balls in view."""
+def _closest(
+    balls: Array, radii: Array, width: int, height: int, focal_length: float, aim: Array | None = None
+) -> Array:
+    """Closest position, in the camera's own axes, with all balls in view, and a given point in the center."""
     position = np.empty(3)
     depths = []
     for axis, half_size in ((0, 0.5 * width), (1, 0.5 * height)):
@@ -91,7 +98,7 @@ def _closest(balls: Array, radii: Array, width: int, height: int, focal_length: 
         reach = radii * math.hypot(1.0, tangent)
         low = np.min(tangent * balls[:, 2] + balls[:, axis] - reach)
         high = np.min(tangent * balls[:, 2] - balls[:, axis] - reach)
-        position[axis] = 0.5 * (low - high)
-        depths.append(0.5 * (low + high) / tangent)
+        position[axis] = 0.5 * (low - high) if aim is None else aim[axis]
+        depths.append(min(low - position[axis], high + position[axis]) / tangent)
     position[2] = min(depths)
     return position
