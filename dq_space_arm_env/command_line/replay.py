@@ -63,7 +63,7 @@ def replay(
             click.get_current_context(),
         )
     from dq_space_arm_env import load_scene
-    from dq_space_arm_env.command_line.replaying import collect_flights
+    from dq_space_arm_env.command_line.replaying import collect_flights, open_in_browser
     from dq_space_arm_env.viewing.replay import write_replay
 
     sources = [_labeled(flight) for flight in flights]
@@ -82,9 +82,7 @@ def replay(
     out.parent.mkdir(parents=True, exist_ok=True)
     size = write_replay(out, shown, robot, *others).stat().st_size / 1e6
     if show:
-        import webbrowser
-
-        webbrowser.open(out.resolve().as_uri())
+        open_in_browser(out)
     names = [robot.name, *(scene.name for _, scene in others)]
     count = len(shown) + sum(len(flights) for flights, _ in others)
     if as_json:
@@ -99,4 +97,9 @@ def _labeled(text: str) -> tuple[str | None, str]:
     """Split LABEL=FLIGHT; a file, or the folder before "#3", may have "=" in its name."""
     label, mark, source = text.partition("=")
     is_path = Path(text).exists() or Path(text.rpartition("#")[0] or text).exists()
+    if not text or not (source or is_path or not mark):
+        raise click.UsageError(
+            f"FLIGHT: {text!r} names none: give a file, a folder or a policy, as LABEL=FLIGHT to name it",
+            click.get_current_context(silent=True),
+        )
     return (None, text) if not mark or is_path else (label, source)

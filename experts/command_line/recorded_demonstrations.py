@@ -9,6 +9,7 @@ from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.parameters import has_grasp
 from dq_space_arm_env.task.trajectory import Trajectory
 from experts.demonstrations import DemonstrationsError, load_demonstrations
+from experts.demonstrations.folder import SETTINGS
 
 
 def read_demonstration(source: str, label: str | None) -> Trajectory | None:
@@ -18,6 +19,8 @@ def read_demonstration(source: str, label: str | None) -> Trajectory | None:
         folder, number = source, "0"
     if not Path(folder).is_dir():
         return None
+    if not any((Path(folder) / name).exists() for name in (SETTINGS, "solution.npz")):
+        raise ValueError(f"{folder} holds neither a solution.npz nor demonstrations, which have a {SETTINGS}")
     try:
         demonstrations = load_demonstrations(Path(folder))
         last = len(demonstrations) - 1

@@ -89,7 +89,9 @@ def test_names_of_folders_with_demonstrations_may_have_an_equals_sign(tmp_path: 
         (["{folder}/half.npz"], "give --scene"),
         (["{folder}/bare.npz"], "name the scene"),
         (["{folder}/facts.npz"], "its facts are not a mapping"),
-        (["{folder}"], "holds no demonstrations"),
+        (["{folder}"], "holds neither a solution.npz nor demonstrations, which have a settings.json"),
+        ([""], "FLIGHT: '' names none: give a file, a folder or a policy"),
+        (["agent="], "FLIGHT: 'agent=' names none"),
         (["{folder}/swing.npz", "--scene", "paper"], "show them on separate pages"),
         (["{folder}/swing.npz", "--seed", "3"], "--seed: 3 is where policies start, and no flight is one"),
     ],
@@ -106,6 +108,40 @@ def test_unusable_input_is_one_sentence(
     assert main(["replay", *given, "--out", str(tmp_path / "page.html")]) == 2
     assert sentence in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "page.html").exists()
+
+
+def test_equal_labels_that_nobody_gave_are_told_apart_by_their_sources(rollout: Path, tmp_path: Path) -> None:
+    for folder in ("paper", "paper-3", "other/paper"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "solution.npz").write_bytes(rollout.read_bytes())
+    heavy = read_flight(rollout).scene.replace({"name": "heavy", "base.mass": 30.0})
+    replace(read_flight(rollout), scene=heavy).save(tmp_path / "heavy.npz")
+
+    def labels(*sources: str, given: dict[str, str] | None = None, scene: Scene | None = None) -> list[str]:
+        named = [((given or {}).get(source), str(tmp_path / source)) for source in sources]
+        parts = collect_flights(named, scene, Console(quiet=True))
+        return [flight.label for flights, _ in parts for flight in flights]
+
+    assert labels("paper", "paper-3") == ["swing (paper)", "swing (paper-3)"]
+    assert labels("swing.npz", "paper") == ["swing (swing.npz)", "swing (paper)"]
+    paths = [tmp_path / folder / "solution.npz" for folder in ("paper", "other/paper")]
+    assert labels("paper", "other/paper") == [f"swing ({path})" for path in paths]
+    assert labels("paper", "paper-3", given={"paper-3": "swing"}) == ["swing (paper)", "swing"]
+    assert labels("paper", "heavy.npz") == ["swing", "swing"], "the list of scenes tells them apart"
+    assert labels("paper", "heavy.npz", scene=heavy) == ["swing (paper)", "swing (heavy.npz)"]
+
+
+def test_a_page_that_no_browser_opens_is_named(
+    rollout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda page: opened.append(page) or len(opened) > 1)
+    out = tmp_path / "page.html"
+    assert main(["replay", str(rollout), "--open", "--out", str(out)]) == 0
+    assert f"no browser was found: open {out} in one yourself" in capsys.readouterr().err
+    assert main(["replay", str(rollout), "--open", "--out", str(out)]) == 0
+    assert capsys.readouterr().err == ""
+    assert opened == [out.as_uri()] * 2
 
 
 def test_a_page_does_not_replace_a_flight(rollout: Path, capsys: pytest.CaptureFixture[str]) -> None:
