@@ -180,6 +180,43 @@ def test_node_accepts_the_scripts_one_by_one_and_joined(tmp_path):
 
 
 @pytest.mark.skipif(which("node") is None, reason="node is not installed")
+def test_rare_inputs_of_a_diverged_flight_stay_in_their_plot(tmp_path):
+    """Most inputs are zero, and the last ones, within the limits, or before these have none, are not."""
+    script = tmp_path / "range.mjs"
+    script.write_text(
+        f'import {{ rangeOf }} from "{BROWSER / "plots.mjs"}";\n'
+        "const flights = [{ note: 'diverges after 1 s' }];\n"
+        "const curve = new Float32Array(100), steady = new Float32Array(100).fill(1);\n"
+        "curve[98] = -3, curve[99] = 4, steady[99] = 1000;\n"
+        "const range = (curve, bounds) => rangeOf({ curves: [curve], disturbed: [null], bounds }, flights);\n"
+        "console.log(JSON.stringify([range(curve, [-5, 5]), range(curve, []), range(steady, [])]));"
+    )
+    printed = subprocess.run(["node", str(script)], check=True, capture_output=True, text=True).stdout
+    bounded, free, cut = json.loads(printed)
+    np.testing.assert_allclose([bounded, free, cut], [(-5.6, 5.6), (-3.42, 4.42), (0.0, 3.18)])
+
+
+@pytest.mark.skipif(which("node") is None, reason="node is not installed")
+def test_shift_and_an_arrow_move_by_a_second_or_by_a_longer_step(tmp_path):
+    script = tmp_path / "keys.mjs"
+    script.write_text(
+        f'import {{ listenToKeys }} from "{BROWSER / "gestures.mjs"}";\n'
+        "const moves = [], commands = { changed() {} };\n"
+        "const document = { addEventListener(name, call) { this.press = call; }, querySelector() {} };\n"
+        "globalThis.document = document;\n"
+        "const event = { shiftKey: true, getModifierState() {}, preventDefault() {} };\n"
+        "event.target = { closest() {} };\n"
+        "for (const dt of [0.1, 0.4, 2.5]) {\n"
+        "  listenToKeys({ player: { dt, step: (count) => moves.push(count) }, camera: null, commands });\n"
+        '  for (const key of ["ArrowLeft", "ArrowRight"]) document.press({ ...event, key });\n'
+        "}\n"
+        "console.log(JSON.stringify(moves));"
+    )
+    printed = subprocess.run(["node", str(script)], check=True, capture_output=True, text=True).stdout
+    assert json.loads(printed) == [-10, 10, -3, 3, -1, 1]
+
+
+@pytest.mark.skipif(which("node") is None, reason="node is not installed")
 def test_blended_poses_are_screw_motions(tmp_path):
     """The page's blend of two instants against the screw motion between them; a step turns by 0.6 degrees."""
     start = poses.from_axis_angle((1.0, 0.0, 0.0), 0.3, (0.2, -1.0, 4.0))

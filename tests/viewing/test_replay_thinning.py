@@ -34,6 +34,15 @@ def test_short_flights_stay_as_they_are(paper, make_flight):
     assert all(one is other for one, other in zip(thinned(flights), flights, strict=True))
 
 
+def test_a_short_flight_keeps_its_steps_beside_a_long_one(paper, make_flight, monkeypatch):
+    short, long, longer = prepare([make_flight(paper, steps=steps) for steps in (20, 500, 800)], paper)
+    monkeypatch.setattr(thinning, "LARGEST", thinning._size(short) + thinning._size(long))
+    flights = thinned([longer, short, long])
+    assert flights[1] is short
+    assert [flight.stride for flight in flights] == [4, 1, 2]
+    assert sum(map(thinning._size, flights)) < thinning.LARGEST
+
+
 def test_poses_and_errors_are_those_of_the_instants_that_stay(long_flight, monkeypatch):
     scene, flight = long_flight
     whole = prepare([flight], scene)[0]

@@ -72,7 +72,7 @@ def replay_page(
     """Make a page that shows flights in 3-D and as curves.
 
     The first flight is drawn solid and the others as ghosts, until the reader selects another. Where all
-    flights of a scene are longer than a page should be, instants of them are left out evenly.
+    flights of a scene are longer than a page should be, instants of the longest are left out evenly.
 
     Args:
         flights: One to six, of any lengths.

@@ -16,7 +16,7 @@ LARGEST = 3_300_000
 
 
 def thinned(flights: Sequence[ShownFlight], thrusters: int = 0) -> list[ShownFlight]:
-    """Leave out instants evenly, where all flights together would be too large.
+    """Leave out instants evenly, where all flights together would be too large, of those above their share.
 
     Poses and errors are those of the instants that stay, the ends among them. Of the inputs the smallest and
     the largest between two instants stay, in their order, one for each of two steps. A violation stays one.
@@ -28,8 +28,15 @@ def thinned(flights: Sequence[ShownFlight], thrusters: int = 0) -> list[ShownFli
     Returns:
         The same flights, or ones with fewer steps, longer time steps, and `stride` set.
     """
-    stride = math.ceil(sum(_size(flight, thrusters) for flight in flights) / LARGEST)
-    return [_thinned(flight, min(stride, flight.steps)) if stride > 1 else flight for flight in flights]
+    sizes = [_size(flight, thrusters) for flight in flights]
+    few, room = list(flights), float(LARGEST)
+    # From the smallest: what it leaves of its share is for the larger ones.
+    for count, place in enumerate(sorted(range(len(few)), key=sizes.__getitem__)):
+        stride = math.ceil(sizes[place] * (len(few) - count) / room)
+        if stride > 1:
+            few[place] = _thinned(few[place], min(stride, few[place].steps))
+        room -= sizes[place] / stride
+    return few
 
 
 def _size(flight: ShownFlight, thrusters: int = 0) -> int:

@@ -49,10 +49,11 @@ export function moveWithPointers(element, camera, changed) {
 
 /** Call what belongs to a key; keys that the focused element needs itself are left to it. */
 export function listenToKeys({ player, camera, commands }) {
+  const second = Math.max(Math.round(1 / player.dt), 1); // in time steps
   const keys = {
     " ": () => player.toggle(),
-    arrowleft: (event) => player.step(event.shiftKey ? -Math.round(1 / player.dt) : -1),
-    arrowright: (event) => player.step(event.shiftKey ? Math.round(1 / player.dt) : 1),
+    arrowleft: (event) => player.step(event.shiftKey ? -second : -1),
+    arrowright: (event) => player.step(event.shiftKey ? second : 1),
     home: () => player.seek(0),
     end: () => player.seek(player.duration),
     "[": () => player.shift(-1),

@@ -32,9 +32,10 @@ export function rangeOf(panel, flights) {
     for (const curve of [panel.curves[index], panel.disturbed[index]]) {
       let values = curve ?? [];
       if (curve && flight.note) {
-        // What diverged would flatten all the rest.
+        // What diverged would flatten all the rest. Where most are zero, that cap is too.
         const sizes = Float32Array.from(curve, Math.abs).sort();
-        const cap = 3 * sizes[Math.floor(0.9 * (sizes.length - 1))];
+        const most = 3 * sizes[Math.floor(0.9 * (sizes.length - 1))];
+        const cap = Math.max(most, ...panel.bounds.map(Math.abs)) || Infinity;
         values = curve.map((value) => Math.min(Math.max(value, -cap), cap));
       }
       for (const value of values) {
