@@ -136,6 +136,18 @@ def test_drawn_starts_are_in_view(name):
         assert ((seen > 0) & (seen < size)).all()
 
 
+@pytest.mark.parametrize("name", ["paper", "far"])
+def test_starts_of_episodes_are_in_view(name):
+    """Base and arm; `far` has its base anywhere within 0.4 m and 0.5 rad."""
+    scene, env = load_scene(name), DQSpaceArmEnv(name)
+    renderer, size = Renderer(scene), (640, 480)
+    for seed in range(50):
+        env.reset(seed=seed)
+        frames = env.kernels.frame_poses(env.state)
+        seen = renderer.camera.project(np.array(poses.position(frames.T)).T)[:, :2]
+        assert ((seen > 0) & (seen < size)).all()
+
+
 @pytest.mark.parametrize("name", ["paper", "planar"])
 def test_tip_is_projected_to_where_the_kernels_have_it(name):
     """The origin of the tip's axes, drawn alone in front of everything, is seen at the kernels' tip pose."""

@@ -147,6 +147,8 @@ class SpacecraftModel:
         # Less than the arm's reach: it works between start and target, and is seen better from near.
         reach = self._arm_length + sum(self._masts) + self._overhang()
         target = 1.2 * self.axis_length + math.sqrt(3.0) * spread.target_position
+        drawn = self._thickness + spread.base_position
+        levers = spread.base_rotation * np.linalg.norm(frames - frames[0], axis=1)
         body = [
             (frames[0], 0.75 * float(np.linalg.norm(self._body_size))),
             (frames[0] + wing, 0.3 * float(self._body_size.max())),
@@ -157,6 +159,7 @@ class SpacecraftModel:
             (shoulder, 0.6 * reach),
             (frames[-1], 0.15 * reach + self._overhang()),
             *((frames[end], 0.15 * reach) for end in self._branch_ends),
+            *zip(frames, drawn + levers, strict=True),
             *((np.array(poses.position(tuple(pose))), target) for pose in self._target_poses[0]),
             *self._shape_balls(poses_at_start),
         ]
