@@ -170,11 +170,12 @@ class UrdfTree:
         more try is enough; those in `motorless` need none.
         """
         for name in locked:
-            known = [joint for joint in self.robot.joints if self.robot.joints[joint] not in chain]
+            joints = self.robot.joints.values()
+            known = [each.name for each in joints if each.type != "fixed" and each not in chain]
             if name not in known:
                 there = f"these are {_some(known)}" if known else "there is none"
                 raise SceneError(
-                    f"lock_branches: {name!r} is not a joint beside the way from base to tip; "
+                    f"lock_branches: {name!r} is not a movable joint beside the way from base to tip; "
                     f"{did_you_mean(str(name), known)}{there}"
                 )
         rank = {name: index for index, name in enumerate(self.robot.joints)}
@@ -198,9 +199,9 @@ class UrdfTree:
         """Name all joints that a scene cannot have, and how to hold them."""
         held = [*reasons]
         for name in held:  # it grows: what is mimicked must not move either
-            mimicked = self.robot.joints[name].mimics
-            if mimicked in self.robot.joints and mimicked not in held:
-                held.append(mimicked)
+            mimicked = self.robot.joints.get(self.robot.joints[name].mimics or "")
+            if mimicked is not None and mimicked.type != "fixed" and mimicked.name not in held:
+                held.append(mimicked.name)
         named = ", ".join(f"joint {name!r} {reason}" for name, reason in reasons.items())
         driven = [each for each in moving if each.name not in motorless and each.name not in held]
         missing = missing_efforts(driven)

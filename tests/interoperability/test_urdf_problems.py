@@ -130,6 +130,18 @@ def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
         scene_from_urdf(text, "arm")
 
 
+def test_fixed_joints_are_none_to_lock():
+    text = robot(*GOOD, joint("f", "arm", "b", "fixed"), B, joint("g", "b", "c"), link("c"))
+    for name in ("f", "j1"):
+        with pytest.raises(SceneError, match=f"'{name}' is not a movable joint beside the .*; these are g$"):
+            scene_from_urdf(text, "b", lock_branches=[name])
+    assert len(scene_from_urdf(text, "b", lock_branches=["g"]).links) == 1
+    follower = joint("g", "b", "c", content='<limit effort="1"/><mimic joint="f"/>')
+    text = robot(*GOOD, joint("f", "arm", "b", "fixed"), B, follower, link("c"))
+    with pytest.raises(SceneError, match=r"'g' mimics joint 'f'; .* lock_branches=\['g'\] holds such"):
+        scene_from_urdf(text, "b")
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -142,9 +154,9 @@ def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
         ({"tip": "arm", "passive": ["j2"]}, "'j2' is not a joint that moves a mass; these are j1"),
         (
             {"tip": "arm", "lock_branches": ["j1"]},
-            "lock_branches: 'j1' is not a joint beside the way from base to tip; there is none$",
+            "lock_branches: 'j1' is not a movable joint beside the way from base to tip; there is none$",
         ),
-        ({"tip": "arm", "lock_branches": [1]}, "lock_branches: 1 is not a joint beside the way"),
+        ({"tip": "arm", "lock_branches": [1]}, "lock_branches: 1 is not a movable joint beside the way"),
         ({"tip": "arm", "lock_branches": 1}, "lock_branches = 1: must be a list of names of joints, or True"),
         ({"tip": "arm", "passive": None}, "passive = None: must be a list of names of joints"),
         ({"tip": "arm", "joint_torque": True}, "joint_torque = True: must be a number greater than 0, N m"),
