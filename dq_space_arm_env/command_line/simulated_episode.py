@@ -108,6 +108,11 @@ def read_noise(texts: Sequence[str], scene: Scene) -> NDArray[np.float64]:
     fractions = np.zeros(layout.n_u)
     parts = {name: part for name, part in vars(layout.control).items() if isinstance(part, slice)}
     present = {name: part for name, part in parts.items() if part.stop > part.start}
+    kinds = [text.rpartition("=")[0] for text in texts]
+    for kind in kinds:
+        if kinds.count(kind) > 1:
+            given = ", ".join(text for text, each in zip(texts, kinds, strict=True) if each == kind)
+            raise ValueError(f"--noise {given}: should be given once for {kind or 'all inputs'}")
     for text in sorted(texts, key=lambda each: "=" in each):  # the fraction first
         name, mark, number = text.rpartition("=")
         if mark and name not in present:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from dq_space_arm_env.command_line.names import SCENE
-from dq_space_arm_env.command_line.verb import json_option, keeping
+from dq_space_arm_env.command_line.verb import Interrupted, json_option
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, print_document, table_console
 from dq_space_arm_env.common.files import check_writable
 
@@ -39,6 +39,7 @@ def report(scene: str, quick: bool, out: Path | None, as_json: bool) -> int:
     """
     from dq_space_arm_env import load_scene
     from experts.report.reproduction import results_folder
+    from experts.report.scene_report import NAME
     from experts.report.scene_report import report as measure
 
     loaded = load_scene(scene)
@@ -46,8 +47,12 @@ def report(scene: str, quick: bool, out: Path | None, as_json: bool) -> int:
     check_writable(folder)
     folder.mkdir(parents=True, exist_ok=True)
     console = table_console(stderr=as_json)
-    with keeping(f"the finished parts are in {folder}; repeat the command to resume"):
+    try:
         page = measure(loaded, folder, console, quick=quick)
+    except KeyboardInterrupt as error:
+        if not (folder / f"{NAME}.json").exists():
+            raise Interrupted("no part is finished, and nothing is saved") from error
+        raise Interrupted(f"the finished parts are in {folder}; repeat the command to resume") from error
     if page.shortcomings:
         console.print(f"Exit status 1: {' '.join(page.shortcomings)}", markup=False)
     if as_json:

@@ -53,8 +53,8 @@ def solve(
     """Solve SCENE, a name or a file, by control-limited differential dynamic programming.
 
     The output folder receives solution.npz (trajectory, controls, feedback gains), scene.yaml, summary.json,
-    and figures on request. Exit status 1: the solve did not converge; 130: interrupted. The best trajectory
-    so far is always saved, flagged as not converged.
+    and figures on request. Exit status 1: the solve did not converge; 130: interrupted. After the
+    preparation the best trajectory so far is always saved, flagged as not converged.
     """
     from dq_space_arm_env import load_scene
     from dq_space_arm_env.dynamics.step_stability import advice

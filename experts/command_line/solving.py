@@ -21,6 +21,7 @@ from dq_space_arm_env.command_line.simulated_episode import (
     error_rows,
     flown_catches,
 )
+from dq_space_arm_env.command_line.verb import keeping
 from dq_space_arm_env.common.files import json_value, to_json, write_atomically
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.tables import plain_table
@@ -91,12 +92,13 @@ def solve(
     limits: dict[str, Any] = {} if max_iterations is None else {"max_iterations": max_iterations}
     began = perf_counter()
     with SolveProgress(console, scene) as progress:
-        begun = begin(scene, seed, start)
-        solver: BoxDDP | GuidedDDP = GuidedDDP(scene, **limits) if guided else BoxDDP(scene, **limits)
-        before = None
-        if isinstance(solver, GuidedDDP):
-            solver.prepare(progress.update)  # now, to time this solve alone
-            before = sum(known.iterations for known in solver.library)
+        with keeping("nothing is saved yet, as the first trajectory comes after the preparation"):
+            begun = begin(scene, seed, start)
+            solver: BoxDDP | GuidedDDP = GuidedDDP(scene, **limits) if guided else BoxDDP(scene, **limits)
+            before = None
+            if isinstance(solver, GuidedDDP):
+                solver.prepare(progress.update)  # now, to time this solve alone
+                before = sum(known.iterations for known in solver.library)
         prepared = perf_counter()
         progress.start()
         solution = solver.solve(begun.state, callback=progress.update, parameters=begun.parameters)

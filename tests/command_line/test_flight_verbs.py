@@ -144,6 +144,19 @@ def test_an_interrupt_saves_the_best_so_far(
     assert Solution.load(tmp_path / "solution.npz").stop_reason == "interrupted"
 
 
+def test_an_interrupted_preparation_says_that_nothing_is_saved(
+    scene_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(self: SolveProgress, record: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SolveProgress, "update", interrupt)
+    monkeypatch.setattr("experts.guesses.guided.read_preparation", lambda key: None)
+    assert main(["solve", scene_file, "--out", str(tmp_path / "out")]) == INTERRUPTED
+    assert "Interrupted: nothing is saved yet" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_zero_and_random_inputs(scene_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "deep" / "flight.npz"
     arguments = ["simulate", scene_file, "--seed", "5", "--json"]
@@ -331,6 +344,21 @@ def test_noise_in_units_of_the_actuators() -> None:
     )
     assert flown.noise is not None
     assert flown.noise.std(axis=0) == pytest.approx([2.5] * 3 + [0.5] * 3 + [0.02] * 3, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("texts", "sentence"),
+    [
+        (["0.1", "0.2"], "--noise 0.1, 0.2: should be given once for all inputs"),
+        (
+            ["base_force=1", "0.1", "base_force=2"],
+            "--noise base_force=1, base_force=2: .* once for base_force",
+        ),
+    ],
+)
+def test_noise_is_given_once(texts: list[str], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        read_noise(texts, load_scene("planar"))
 
 
 def test_noise_in_units_needs_limits_that_stay() -> None:

@@ -331,6 +331,18 @@ def test_an_interrupted_report_keeps_its_parts_and_resumes(
     assert page.shortcomings == []
 
 
+def test_an_interrupt_before_the_first_part_does_not_promise_to_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    second = MadeUpPart()
+    for parts in ({"first": MadeUpPart(interrupts=True)}, {"a": second, "b": MadeUpPart(interrupts=True)}):
+        monkeypatch.setattr(scene_report, "PARTS", parts)
+        assert main(["report", "planar", "--out", str(tmp_path / "rep")]) == 130
+        said = " ".join(capsys.readouterr().err.split())
+        kept = "the finished parts are in" if second.measured else "no part is finished, and nothing is saved"
+        assert f"Interrupted: {kept}" in said
+
+
 def test_an_interrupted_resumption_keeps_the_parts_that_it_found(
     short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
