@@ -41,6 +41,8 @@ def show(
         raise ValueError(f"-n: {n}, should be at least 1")
     if seed is not None and seed < 0:
         raise ValueError(f"--seed: {seed}, should be at least 0")
+    if gif is not None and gif.suffix.lower() != ".gif":
+        raise ValueError(f"--gif: {gif}, should end in .gif")
     if gif is not None and find_spec("PIL") is None:
         raise ModuleNotFoundError('--gif: needs Pillow: pip install "dq-space-arm[plots]"')
     acting = as_policy(policy, trust=trust, normalize=normalize)

@@ -42,10 +42,17 @@ def run(
 
     Raises:
         KeyboardInterrupt: If interrupted before there is anything to save.
-        ValueError: If the scene cannot be solved or replayed, or figures are wanted without Matplotlib.
+        ValueError: If the scene cannot be solved or replayed, or figures are wanted without Matplotlib, or
+            `readme_picture` without figures or with another ending than `.png`.
     """
     if figures and find_spec("matplotlib") is None:
         raise ValueError('figures need matplotlib: pip install "dq-space-arm[plots]", or give --no-figures')
+    if readme_picture is not None and not figures:
+        raise ValueError(
+            "--readme-picture asks for a figure, and --no-figures for none: leave one of them out"
+        )
+    if readme_picture is not None and readme_picture.suffix.lower() != ".png":
+        raise ValueError(f"--readme-picture: {readme_picture}, should end in .png")
     console = table_console(stderr=as_json)
     folder.mkdir(parents=True, exist_ok=True)
     with SolveProgress(console, scene) as progress:

@@ -122,6 +122,8 @@ def test_interrupted_solve_saves_the_best_so_far(
         (["--scene", "papr"], "did you mean 'paper'?"),
         (["--scene", "{folder}/infinite.yaml"], "give each actuator a finite limit"),
         (["--max-iterations", "-1"], "max_iterations is -1"),
+        (["--readme-picture", "{folder}/a.png", "--no-figures"], "and --no-figures for none: leave one of"),
+        (["--readme-picture", "{folder}/a.gif"], "a.gif, should end in .png"),
     ],
 )
 def test_unusable_input_is_one_sentence(

@@ -128,6 +128,13 @@ def test_the_verb_writes_numbers_and_pictures(exported, tmp_path, capsys):
     assert "-n: 0, should be at least 1" in capsys.readouterr().err
 
 
+def test_the_verb_refuses_an_animation_of_another_ending(exported, tmp_path, capsys):
+    words = ["evaluate", "show", str(exported), "--no-picture", "--out", str(tmp_path / "out")]
+    assert main([*words, "--gif", str(tmp_path / "flight.png")]) == 2
+    assert "flight.png, should end in .gif" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "flight.png").exists()
+
+
 def test_files_are_written_where_nothing_can_be_printed(exported, tmp_path, fill_output):
     fill_output()
     out = tmp_path / "out"
