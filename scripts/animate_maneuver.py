@@ -67,9 +67,10 @@ def _run(options: argparse.Namespace) -> int:
         content = encode_gif(pictures, options.fps, options.hold, options.colors)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(options.out, content)
+    noun = "picture" if len(pictures) == 1 else "pictures"
     verdict = "converged" if solution.converged else f"NOT CONVERGED: {solution.message}"
     Console(highlight=False).print(
-        f"{options.out}: {len(pictures)} pictures, {len(content) / 1e6:.2f} MB; the solution has {verdict}",
+        f"{options.out}: {len(pictures)} {noun}, {len(content) / 1e6:.2f} MB; the solution has {verdict}",
         markup=False,
         soft_wrap=True,
     )

@@ -9,6 +9,7 @@ rk4 takes about three times as long, so at equal error rk4 is faster by orders o
 """
 
 import argparse
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
@@ -16,6 +17,7 @@ from time import perf_counter
 import numpy as np
 
 from dq_space_arm_env import compile_scene
+from dq_space_arm_env.command_line.verb_program import run_to_end
 
 DURATION = 3.0  # s
 
@@ -73,4 +75,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_to_end(main))  # errors of the input as sentences

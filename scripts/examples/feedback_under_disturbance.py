@@ -8,6 +8,7 @@ Expect: the open loop misses from 0.005 on, the gains arrive up to 0.01, the rec
 """
 
 import argparse
+import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env import compile_scene
+from dq_space_arm_env.command_line.verb_program import run_to_end
 from experts import BoxDDP, RecedingHorizonExpert
 from experts.maneuver import Maneuver
 
@@ -82,4 +84,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_to_end(main))  # errors of the input as sentences

@@ -9,6 +9,7 @@ machine code, which takes about a minute; later runs load it from the cache.
 """
 
 import argparse
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import gymnasium
 import numpy as np
 
 from dq_space_arm_env import compile_scene  # importing it registers the environment
+from dq_space_arm_env.command_line.verb_program import run_to_end
 from experts import BoxDDP
 
 
@@ -66,4 +68,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_to_end(main))  # errors of the input as sentences

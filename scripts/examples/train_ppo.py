@@ -12,6 +12,7 @@ Expect: in a minute on one core (4 million steps) the median errors at the end f
 """
 
 import argparse
+import sys
 from pathlib import Path
 from time import perf_counter
 
@@ -25,6 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 import dq_space_arm_env  # registers the environments
 from agents import SB3VecEnv, evaluate, export_policy
 from agents.wrappers.vector import RepeatAction, ShapeReward, ShrinkActionSpace
+from dq_space_arm_env.command_line.verb_program import run_to_end
 
 REPEAT = 20
 """Time steps for which an action is held: 0.3 s in scene `paper`."""
@@ -86,4 +88,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_to_end(main))  # errors of the input as sentences

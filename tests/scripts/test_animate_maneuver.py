@@ -34,6 +34,14 @@ def test_the_animation_refuses_nonsense_before_it_solves(options, sentence, tmp_
     assert not list(tmp_path.iterdir())
 
 
+def test_a_single_picture_is_called_one(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("PIL.Image")
+    monkeypatch.setattr(animate_maneuver, "GuidedDDP", partial(GuidedDDP, max_iterations=0))
+    options = ["--scene", "planar", "--seconds", "0.001", "--width", "16", "--height", "16"]
+    assert animate_maneuver.main([*options, "--out", str(tmp_path / "a.gif")]) == 0
+    assert "a.gif: 1 picture, " in capsys.readouterr().out
+
+
 def test_the_gallery_is_complete_small_and_of_the_present_scenes():
     records = json.loads((GALLERY / RECORDS).read_text(encoding="utf-8"))
     assert list(records) == list_scenes()

@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,27 @@ def test_unusable_robot_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFi
     with pytest.raises(SystemExit):
         run("own_scene", "--urdf", str(tmp_path / "robot.urdf"), "--out", str(tmp_path))
     assert "'tool0' is not a link of 'stick'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "compare_integrators",
+        "feedback_under_disturbance",
+        "first_steps",
+        pytest.param("train_ppo", marks=[pytest.mark.slow, pytest.mark.agents]),
+    ],
+)
+def test_an_unknown_scene_is_one_sentence(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name == "train_ppo":
+        pytest.importorskip("stable_baselines3")
+    monkeypatch.setattr("sys.argv", [name, "--scene", "papr"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(LESSON.with_name(f"{name}.py")), run_name="__main__")
+    assert end.value.code == 2
+    assert "did you mean 'paper'" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.slow
