@@ -34,6 +34,7 @@ _STEP = 1.0  # s
 _FRACTIONS_OF_PI = 6.0, 4.0, 3.0, 2.0, 1.5, 1.0
 _ROUNDED_PI = 0.002  # degrees, within which an angle is such a fraction of pi
 _SPIN = 1.0  # rad/s, of a target: a turn in six seconds
+_HALF_TURN = 180.0  # degrees, the largest attitude error
 _NEAR = 2.0  # times a tolerance, of a way to the target
 _ROUNDED = 9  # digits after the point of a distance, m
 _SPEEDS = 0.5, 45.0  # m/s and degrees/s, on the mean way to the target
@@ -197,6 +198,11 @@ def _times(scene: Scene) -> Iterator[str]:
         yield (
             f"simulation.steps: an episode of {seconds:.3g} s for {meters:.3g} m and {degrees:.3g} degrees "
             "to the target: is it long enough?"
+        )
+    if scene.success.attitude_error_deg >= _HALF_TURN:
+        yield (
+            f"success.attitude_error_deg: {scene.success.attitude_error_deg:g} degrees, half a turn: no "
+            "attitude fails"
         )
     tolerance = scene.success.position_error
     if not drifts and scene.target.motion is None and 0.0 < meters < _NEAR * tolerance:

@@ -15,7 +15,9 @@ from dq_space_arm_env.command_line.verb import json_option
 from dq_space_arm_env.common.console import (
     FAILURE,
     SUCCESS,
+    WIDTH,
     complain,
+    has_width,
     message_console,
     print_document,
     say,
@@ -58,7 +60,7 @@ def list_(as_json: bool) -> None:
         )
         return
     # Click's own list, which appears before rich would be imported.
-    formatter = click.HelpFormatter(max_width=110)
+    formatter = click.HelpFormatter(width=None if has_width(sys.stdout) else WIDTH, max_width=WIDTH)
     formatter.write_dl(list(found.items()))
     click.echo(formatter.getvalue(), nl=False)
 

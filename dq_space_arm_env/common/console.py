@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 SUCCESS, FAILURE, UNUSABLE, INTERNAL, INTERRUPTED = 0, 1, 2, 70, 130
 """Exit statuses: done; done, but below what was asked for; unusable input; a bug; interrupted."""
 
+WIDTH = 110
+"""Columns of tables in files and pipes."""
+
 
 @cache
 def _console_class() -> type[Console]:
@@ -38,11 +41,15 @@ def _console_class() -> type[Console]:
     return PrintableConsole
 
 
-def table_console(width: int = 110, *, stderr: bool = False) -> Console:
+def table_console(width: int = WIDTH, *, stderr: bool = False) -> Console:
     """Make a console for tables; `width` applies to files and pipes, which have none."""
-    stream = sys.stderr if stderr else sys.stdout
-    known = stream.isatty() or os.environ.get("COLUMNS", "").strip("0").isdigit()
+    known = has_width(sys.stderr if stderr else sys.stdout)
     return _console_class()(stderr=stderr, highlight=False, width=None if known else width)
+
+
+def has_width(stream: IO[str]) -> bool:
+    """Whether a terminal or the user sets the width of a stream, unlike that of a file or a pipe."""
+    return stream.isatty() or os.environ.get("COLUMNS", "").strip("0").isdigit()
 
 
 def message_console() -> Console:

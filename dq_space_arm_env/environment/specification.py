@@ -29,7 +29,8 @@ def action_space(kernels: Kernels) -> spaces.Box:
     limits = zip(layout.control.names, layout.control_limit, strict=True)
     unlimited = [name for name, limit in limits if np.isinf(limit)]
     if unlimited or not layout.n_u:
-        problem = f"{', '.join(unlimited)} has no finite limit" if unlimited else "it has no actuator"
+        verb = "has" if len(unlimited) == 1 else "have"
+        problem = f"{', '.join(unlimited)} {verb} no finite limit" if unlimited else "it has no actuator"
         raise ValueError(
             f"scene {kernels.scene.name!r} has no normalized actions: {problem}; "
             "give each actuator a finite limit"

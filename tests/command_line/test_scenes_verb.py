@@ -35,6 +35,7 @@ simulation:
 def test_list_has_every_scene(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenes", "list"]) == SUCCESS
     output = capsys.readouterr().out
+    assert 80 < max(map(len, output.splitlines())) <= 110
     assert main(["scenes", "list", "--json"]) == SUCCESS
     rows = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in rows] == list_scenes()
@@ -234,6 +235,7 @@ NEAR = {
             r"constraints: limits of 'link 1': 500 m: millimeters\?",
         ),
         ({"simulation.dt": 15}, r"simulation.dt: 15 s: milliseconds\?"),
+        ({"success.attitude_error_deg": 180}, "success.attitude_error_deg: 180 degrees, half a turn: no att"),
         ({"simulation.steps": 100}, r"simulation.steps: an episode of 1.5 s for .* m and .* degrees to the"),
         ({"base.mass": 20}, "base.mass: 20 kg, lighter than the arm of 25 kg: is the spacecraft missing"),
         ({"base.mass": 105000}, r"base.inertia: .* 105000 kg that is 12 mm wide: a mass in grams"),

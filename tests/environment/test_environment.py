@@ -349,8 +349,10 @@ def test_environments_pickle_and_copy():
 def test_scenes_that_have_no_normalized_actions_are_refused():
     scene = load_scene("paper")
     unlimited = scene.actuators.model_dump() | {"base_force": {"limit": float("inf")}}
-    with pytest.raises(ValueError, match=r"base f.* has no finite limit"):
+    with pytest.raises(ValueError, match=r"base force x, .* base force z have no finite limit"):
         make(scene.replace(actuators=unlimited))
+    with pytest.raises(ValueError, match=r": link \S+ torque has no finite limit"):
+        make(load_scene("planar").replace({"links.0.torque_limit": float("inf")}))
     with pytest.raises(ValueError, match="it has no actuator"):
         make(scene.replace(actuators=Actuators()))
     with pytest.raises(ValueError, match="render_mode: 'ansi' is unknown"):
