@@ -7,6 +7,7 @@ robot, so that another maneuver of a known robot costs nothing there.
 from __future__ import annotations
 
 import json
+from functools import cache
 from typing import Any
 
 from dq_space_arm_env import Scene, list_scenes, load_scene
@@ -32,7 +33,8 @@ _PARTS = ("base", "links", "tip_link", "wrist", "tip", "payload", "other_tips", 
 _OF_THE_TASK: dict[str, Any] = {"links": {"__all__": {"name", "torque_limit"}}, "simulation": {"dt", "steps"}}
 
 
-def robots() -> list[str]:
+@cache
+def robots() -> tuple[str, ...]:
     """Names of shipped scenes, one for each distinct robot; `paper` is the first.
 
     A scene with phases has a robot in each of them, which `tests/task/test_phases.py` compares with its own.
@@ -44,7 +46,7 @@ def robots() -> list[str]:
         scene = load_scene(name)
         if not scene.phases:
             first.setdefault(robot(scene), name)
-    return list(first.values())
+    return tuple(first.values())
 
 
 def robot(scene: Scene) -> str:

@@ -41,8 +41,12 @@ def bounds(camera, corners):
     return seen.min(axis=0), seen.max(axis=0)
 
 
+def gives_shapes(scene):
+    return '"geometry"' in scene.model_dump_json(exclude_defaults=True)
+
+
 @pytest.mark.sampled
-@pytest.mark.parametrize("name", [n for n in list_scenes() if "geometry:" not in load_scene(n).to_yaml()])
+@pytest.mark.parametrize("name", [name for name in list_scenes() if not gives_shapes(load_scene(name))])
 def test_scenes_without_shapes_look_as_before(name):
     """No shapes, or an empty list of them, leave base, arm, payload and target as they are, to the pixel."""
     scene = load_scene(name)
