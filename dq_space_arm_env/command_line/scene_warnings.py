@@ -15,7 +15,7 @@ from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
 from dq_space_arm_env.scene import Link, Pose, Scene, StateLayout
 from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraint_rows import path_rows
-from dq_space_arm_env.scene.motion import Waypoints
+from dq_space_arm_env.scene.motion import Tumbling, Waypoints
 from dq_space_arm_env.scene.parameters import parameters
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.task.constraint_residuals import state_residuals
@@ -38,12 +38,13 @@ _HALF_TURN = 180.0  # degrees, the largest attitude error
 _NEAR = 2.0  # times a tolerance, of a way to the target
 _ROUNDED = 9  # digits after the point of a distance, m
 _SPEEDS = 0.5, 45.0  # m/s and degrees/s, on the mean way to the target
+_ALIKE = 0.01  # of the radius of gyration and of the inertia, between two descriptions of a body
 _TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the efforts of a swing
 
 
 def warnings_of(scene: Scene) -> list[str]:
     """List what is unwise in a valid scene, a sentence each, which names the key and says what would help."""
-    checks = (_units, _masses, limit_warnings, _start, _times, _reach)
+    checks = (_units, _masses, limit_warnings, _start, _times, _reach, _caught)
     return [sentence for check in checks for sentence in check(scene)]
 
 
@@ -264,6 +265,36 @@ def _reach(scene: Scene) -> Iterator[str]:
             f"target: {distance:.3g} m from the center of mass, from which the arm reaches {reach:.3g} m{by}"
             ": it is out of reach"
         )
+
+
+def _caught(scene: Scene) -> Iterator[str]:
+    """A payload that is not the tumbling body from which a catch takes it: the momentum would jump."""
+    motion, payload, grasp = scene.target.motion, scene.payload, scene.target.grasp
+    catches = any(phase.catch is not None for phase in scene.phases)
+    if not catches or payload is None or not isinstance(motion, Tumbling):
+        return
+    turn, inertia = np.array(grasp.rotation_matrix), np.array(payload.inertia)
+    center = turn @ payload.center_of_mass + grasp.position
+    gyration = math.sqrt(np.trace(inertia) / (2.0 * payload.mass))
+    if (apart := float(np.linalg.norm(center))) > _ALIKE * gyration:
+        yield (
+            f"payload.center_of_mass: {apart:.3g} m from the target's origin, about which the body tumbles "
+            "until it is caught: the momentum jumps at the catch; "
+            f"{_shown(-turn.T @ grasp.position)} is there"
+        )
+    held, free = turn @ inertia @ turn.T, np.array(motion.inertia)
+    if np.abs(held / np.trace(held) - free / np.trace(free)).max() > _ALIKE:
+        rows = f"[{', '.join(_shown(row) for row in held)}]"
+        found = rows if np.any(held - np.diag(np.diag(held))) else _shown(np.diag(held))
+        yield (
+            "target.motion.inertia: not in the ratios of payload.inertia, turned by target.grasp: the body "
+            "tumbles as another than is caught, and the momentum jumps at the catch; "
+            f"{found} is the payload's"
+        )
+
+
+def _shown(numbers: Iterable[float]) -> str:
+    return f"[{', '.join(f'{number + 0.0:.6g}' for number in numbers)}]"
 
 
 def _mass_points(scene: Scene) -> tuple[list[float], list[tuple[float, ...]]]:

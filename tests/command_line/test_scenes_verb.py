@@ -275,6 +275,41 @@ def test_the_unwise_is_warned_of(change: dict[str, object], sentence: str) -> No
     assert any(re.match(sentence, each) for each in found), found
 
 
+@pytest.mark.parametrize(
+    ("change", "sentences"),
+    [
+        ({"target.motion.inertia": [6.8, 8.4, 9.2]}, []),
+        ({"target.grasp": {"position": [-0.3501, 0, 0]}}, []),
+        (
+            {"payload.center_of_mass": [0.5, 0.4, 0]},
+            [
+                r"payload.center_of_mass: 0.427 m from the target's origin, .* momentum jumps at the catch; "
+                r"\[0.35, 0, 0\] is there$"
+            ],
+        ),
+        (
+            {"target.grasp.rotation": {"axis": [0, 0, 1], "angle": 90}},
+            [
+                r"payload.center_of_mass: 0.495 m .*; \[0, -0.35, 0\] is there$",
+                r"target.motion.inertia: not in the ratios of payload.inertia, .*; \[4.2, 3.4, 4.6\] is the",
+            ],
+        ),
+        (
+            {"payload.inertia": [[4, 0.5, 0], [0.5, 4, 0], [0, 0, 4]]},
+            [r"target.motion.inertia: .*; \[\[4, 0.5, 0\], \[0.5, 4, 0\], \[0, 0, 4\]\] is the payload's$"],
+        ),
+        ({"payload.center_of_mass": [0.5, 0.4, 0], "target.motion": {"kind": "screw"}}, []),
+    ],
+)
+def test_a_payload_that_is_not_the_body_that_tumbles_is_warned_of(
+    change: dict[str, object], sentences: list[str]
+) -> None:
+    found = warnings_of(load_scene("capture-and-detumble").replace(change))
+    assert len(found) == len(sentences), found
+    for sentence, warning in zip(sentences, found, strict=True):
+        assert re.match(sentence, warning), warning
+
+
 def test_thrusters_also_move_what_other_tips_hold() -> None:
     scene = load_scene("dual-arm").replace({"target.pose.position": [60, 0, 0]})
     held = {"mass": 768.0, "inertia": [9, 9, 9]}  # kg: with the robot 1000
