@@ -246,25 +246,37 @@ def way_to_target(scene: Scene) -> tuple[float, float]:
 
 
 def _reach(scene: Scene) -> Iterator[str]:
-    """A target too far from the center of mass, which only thrusters move."""
+    """Goals of tips too far from the center of mass, which only thrusters move."""
     start, simulation = scene.initial_state, scene.simulation
     if any(start.base_velocity) or any(start.joint_rates):
         return  # it drifts
     masses, centers = _mass_points(scene)
     center, total = np.average(centers, axis=0, weights=masses), sum(masses)
-    last = np.atleast_2d(shown_target(scene)[0])[-1]
-    goal = poses.to_rotation_and_position(tuple(last.tolist()))[1]
     seconds = simulation.steps * simulation.dt
     pushed = 0.25 * _force(scene) / total * seconds**2  # there and to rest, by the largest force
     # From the center of mass the base is at most the arm's share of the mass times its length.
-    reach = arm_length(scene) * (2.0 - scene.base.mass / total) + scene.success.position_error
-    distance = math.dist(goal, center)
-    if distance > reach + pushed:
-        by = f", thrusters move it by {pushed:.3g} m in {seconds:g} s" if pushed else ""
-        yield (
-            f"target: {distance:.3g} m from the center of mass, from which the arm reaches {reach:.3g} m{by}"
-            ": it is out of reach"
-        )
+    share, by = 2.0 - scene.base.mass / total, ""
+    if pushed:
+        by = f", thrusters move it by {pushed:.3g} m in {seconds:g} s"
+    for where, goal, length in _goals(scene):
+        reach, distance = length * share + scene.success.position_error, math.dist(goal, center)
+        if distance > reach + pushed:
+            yield (
+                f"{where}: {distance:.3g} m from the center of mass, from which the arm reaches {reach:.3g} m"
+                f"{by}: it is out of reach"
+            )
+
+
+def _goals(scene: Scene) -> Iterator[tuple[str, tuple[float, ...], float]]:
+    """Where the scene says them, places of the tips at the end, m, and lengths of their arms, m."""
+    aims, bodies = shown_target(scene)
+    aim, body = (np.atleast_2d(path)[-1] for path in (aims, aims if bodies is None else bodies))
+    yield "target", poses.to_rotation_and_position(tuple(aim.tolist()))[1], arm_length(scene)
+    for index, tip in enumerate(scene.other_tips):
+        frame = tuple(body.tolist()) if tip.relative_to == "target" else dual_quaternion.IDENTITY
+        goal = dual_quaternion.multiply(frame, tip.goal.dual_quaternion)
+        length = math.hypot(*tip.frame.position) + _length(scene, scene.body_named(tip.link))
+        yield f"other_tips[{index}].goal", poses.to_rotation_and_position(goal)[1], length
 
 
 def _caught(scene: Scene) -> Iterator[str]:
@@ -325,7 +337,12 @@ def arm_length(scene: Scene) -> float:
     length = math.hypot(*scene.tip.position)
     if scene.wrist is not None:
         length += math.hypot(*scene.wrist.frame.position)
-    limits, body = joint_limits(scene), scene.tip_body
+    return length + _length(scene, scene.tip_body)
+
+
+def _length(scene: Scene, body: int) -> float:
+    """Length of the stretched arm from the base's center of mass to a body's joint, m."""
+    length, limits = 0.0, joint_limits(scene)
     while body:
         link = scene.links[body - 1]
         length += math.hypot(*link.joint.position)

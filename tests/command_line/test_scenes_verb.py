@@ -275,6 +275,20 @@ def test_the_unwise_is_warned_of(change: dict[str, object], sentence: str) -> No
     assert any(re.match(sentence, each) for each in found), found
 
 
+def test_goals_of_other_tips_out_of_reach_are_warned_of_too() -> None:
+    far = "m from the center of mass, from which the arm reaches 2.52 m: it is out of reach$"
+    scene = load_scene("dual-arm").replace({"actuators.base_force": None})
+    for change, where in (
+        ({"goal.position": [-6, 0, 0]}, r"other_tips\[0\].goal: 5.58"),
+        ({"goal.position": [0, 2, 0], "relative_to": "inertial"}, None),
+        ({"goal.position": [0, -6, 0], "relative_to": "inertial"}, r"other_tips\[0\].goal: 6.13"),
+    ):
+        changes = {f"other_tips.0.{key}": value for key, value in change.items()}
+        found = [each for each in warnings_of(scene.replace(changes)) if "out of reach" in each]
+        assert len(found) == (where is not None)
+        assert where is None or re.match(f"{where} {far}", found[0]), found
+
+
 @pytest.mark.parametrize(
     ("change", "sentences"),
     [
