@@ -15,6 +15,7 @@ from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
 from dq_space_arm_env.scene import Link, Pose, Scene, StateLayout
 from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraint_rows import path_rows
+from dq_space_arm_env.scene.constraints import FRAMES
 from dq_space_arm_env.scene.motion import Tumbling, Waypoints
 from dq_space_arm_env.scene.parameters import parameters
 from dq_space_arm_env.scene.path import shown_target
@@ -38,14 +39,24 @@ _HALF_TURN = 180.0  # degrees, the largest attitude error
 _NEAR = 2.0  # times a tolerance, of a way to the target
 _ROUNDED = 9  # digits after the point of a distance, m
 _SPEEDS = 0.5, 45.0  # m/s and degrees/s, on the mean way to the target
+_REFUSED = "constraints that name frames refuse it; rename the link"
 _ALIKE = 0.01  # of the radius of gyration and of the inertia, between two descriptions of a body
 _TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the efforts of a swing
 
 
 def warnings_of(scene: Scene) -> list[str]:
     """List what is unwise in a valid scene, a sentence each, which names the key and says what would help."""
-    checks = (_units, _masses, limit_warnings, _start, _times, _reach, _caught)
+    checks = (_names, _units, _masses, limit_warnings, _start, _times, _reach, _caught)
     return [sentence for check in checks for sentence in check(scene)]
+
+
+def _names(scene: Scene) -> Iterator[str]:
+    """Links whose names constraints refuse, as those of frames."""
+    yield from _together(
+        (f"links[{i}].name", f"{link.name!r} is also a frame of every scene: {_REFUSED}")
+        for i, link in enumerate(scene.links)
+        if link.name in FRAMES
+    )
 
 
 def _units(scene: Scene) -> Iterator[str]:

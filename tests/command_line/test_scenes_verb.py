@@ -196,6 +196,10 @@ NEAR = {
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
+        (
+            {"links.0.name": "tip", "links.2.name": "inertial"},
+            r"links\[0\].name: 'tip' is also a frame of every scene: .* the link Likewise links\[2\].name$",
+        ),
         ({"links.1.joint.position": [0, 0, 200]}, r"links\[1\].joint.position: 200 m .*: millimeters\?"),
         ({"tip.position": [850, 0, 0]}, r"tip.position: 850 m from the last joint: millimeters\?"),
         ({"initial_state.joint_angles": [-30, 50, -90]}, r"initial_state.joint_angles: -30 rad: degrees\?"),
