@@ -162,7 +162,12 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         see = "" if context is None else f" (see {context.command_path} --help)"
-        complain(" ".join(error.format_message().split()) + see)
+        message = " ".join(error.format_message().split())
+        if message.startswith("Got unexpected extra") and any(
+            "--scene" in param.opts for param in getattr(getattr(context, "command", None), "params", ())
+        ):
+            message += "; here a scene is given as --scene SCENE"
+        complain(message + see)
         return error.exit_code
     if _is_out_of_memory(error):
         error.__traceback__ = None  # its frames hold what could be freed

@@ -143,6 +143,7 @@ def test_every_verb_helps_with_examples_that_it_understands(path: tuple[str, ...
         ([*FLIGHT, "--start", "one"], "should be 13 numbers separated by commas"),
         ([*FLIGHT, "--noise", "-1"], "--noise is -1.0"),
         (["demonstrations", "generate", "--shard", "3/2"], "use I/K"),
+        (["demonstrations", "generate", "my.yaml"], "(my.yaml); here a scene is given as --scene SCENE"),
         (["replay", "a.npz", "--label", "one", "--label", "two"], "2 labels for 1 flights"),
         (["train"], "give a configuration: a YAML file, or one of act, apg, apg-from-clone, apg-robust,"),
         (["evaluate"], "name a policy to evaluate"),
