@@ -146,7 +146,8 @@ class UrdfTree:
             raise SceneError(f"tip: no joint moves link {tip!r} with respect to base {base!r}")
         for joint in chain:
             if joint.type not in MOVABLE:
-                free = f": choose link {joint.child!r} as base" if joint.type == "floating" else ""
+                beyond = joint.type == "floating" and joint is not chain[-1]
+                free = f": choose link {joint.child!r} as base" if beyond else ""
                 raise SceneError(
                     f"URDF: joint {joint.name!r} on the way to link {tip!r} is {joint.type}; a scene has "
                     f"{', '.join(MOVABLE)} and fixed joints only{free}"
@@ -189,6 +190,11 @@ class UrdfTree:
                     refused[joint.name] = reason
                 found.append(joint)
                 bodies.append(joint.child if at_body[joint] else joint.parent)
+        for name in locked:
+            joint = self.robot.joints[name]
+            follows = any(joint.mimics == each.name for each in found)
+            if follows and self._has_mass_beyond(joint, joint.parent):
+                refused[name] = f"mimics joint {joint.mimics!r}"
         if refused:
             self._refuse(refused, [*chain, *found], motorless)
         return found

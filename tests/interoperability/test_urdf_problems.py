@@ -118,7 +118,11 @@ FINGERS = (
         (robot(joint("j1", "a", "arm"), B), "its parent link 'a' does not exist; the links are b"),
         (robot(link("arm"), joint("j1", "arm", "arm")), "joint 'j1' connects link 'arm' with itself"),
         (robot(joint("a", "arm", "b"), joint("b", "b", "arm"), link("arm"), B), "joints form a loop: a, b"),
-        (arm("floating"), "choose link 'arm' as base"),
+        (
+            robot(BASE, joint("j1", "base", "b", "floating"), B, joint("j2", "b", "arm"), ARM),
+            "joint 'j1' on the way to link 'arm' is floating; .*: choose link 'b' as base$",
+        ),
+        (arm("floating"), "joint 'j1' on the way to link 'arm' is floating; .* fixed joints only$"),
         (robot(*GOOD[:2], link("arm", BODY + BODY)), "link 'arm': there are 2 <inertial>"),
         ("", "the text '' must begin with '<', or be the path of a file"),
         (b"<robot/>", "neither the path nor the text of a URDF file"),
@@ -226,6 +230,14 @@ def test_numbers_are_those_of_xml(number):
         SceneError, match=r"link 'arm', <inertial>, <mass>: value = .*, it must be a finite number"
     ):
         scene_from_urdf(robot(*GOOD[:2], link("arm", body(number))), "arm")
+
+
+def test_either_joint_of_a_gripper_that_is_locked_alone_brings_up_both():
+    text = robot(*GOOD, *FINGERS[:4])
+    for name in ("j2", "j3"):
+        with pytest.raises(SceneError, match=r"'j3' mimics joint 'j2'; .* lock_branches=\['j3', 'j2'\] "):
+            scene_from_urdf(text, "arm", lock_branches=[name])
+    assert len(scene_from_urdf(text, "arm", lock_branches=["j3", "j2"]).links) == 1
 
 
 def test_a_locked_joint_must_not_follow_the_chain():
