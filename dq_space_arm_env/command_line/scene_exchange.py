@@ -83,6 +83,7 @@ class Imported:
     spacecraft: float = 0.0  # mass that the file does not have, kg
     steps: tuple[StepTrial, ...] = ()  # integrators and time steps that were measured
     joint_torque: float | None = None  # given limit of joints without an effort, N m
+    shapes: int = 0  # of the file that are left out
 
 
 @contextmanager
@@ -147,11 +148,12 @@ def import_urdf(
                 f"simulation: the best steps that were tried end {best.error:.0e} m or rad off, where "
                 f"{ACCURACY:.0e} was asked: --lock JOINT and --lock-branches hold joints that are not needed"
             )
-    written = {joint.child: joint.effort for joint in read_robot(path).joints.values()}
+    robot = read_robot(path)
+    written = {joint.child: joint.effort for joint in robot.joints.values()}
     efforts = tuple(written[link.name] if link.actuated else None for link in scene.links)
     added = (arguments.get("spacecraft") or {}).get("mass", 0.0)
     torque: float | None = arguments.get("joint_torque")
-    return Imported(scene, (*messages, *warnings_of(scene)), efforts, added, steps, torque)
+    return Imported(scene, (*messages, *warnings_of(scene)), efforts, added, steps, torque, robot.shapes)
 
 
 def _spread(scene: Scene, width: float) -> dict[str, float]:
@@ -229,6 +231,7 @@ def record(imported: Imported, file: str, source: str) -> dict[str, Any]:
         "efforts": list(imported.efforts),
         "torque_limits": [link.torque_limit for link in scene.links],
         "steps": [json_value(each._asdict()) for each in imported.steps],
+        "shapes_left_out": imported.shapes,
         "warnings": list(imported.warnings),
     }
 
@@ -272,7 +275,10 @@ def _lines(imported: Imported, file: str) -> Iterator[str]:
     limits_of_joints = joint_limits(scene)
     ranges = sum(math.isfinite(lower) or math.isfinite(upper) for lower, upper, _ in limits_of_joints)
     rates = sum(math.isfinite(rate) for *_, rate in limits_of_joints)
-    yield f"  joints  {ranges} with limits of the angle, {rates} of the rate; edit constraints"
+    if ranges or rates:
+        yield f"  joints  {ranges} with limits of the angle, {rates} of the rate; edit constraints"
+    else:
+        yield "  joints  without limits of the angle or the rate; constraints of kind joint_limits add them"
     start = zip(scene.links, scene.initial_state.joint_angles, strict=True)
     yield f"  start   at rest, {', '.join(_by_kind(start, 'unit', ' at'))}; edit initial_state"
     within = scene.success
@@ -289,6 +295,8 @@ def _lines(imported: Imported, file: str) -> Iterator[str]:
         )
     else:
         yield "  spread  every episode is the same; edit spread before an agent is trained"
+    if imported.shapes:
+        yield f"  shapes  left out: {imported.shapes}; edit geometry for pictures"
     word = quote(file)
     yield f"Next: `dq-space-arm solve {word}`; after edits first `dq-space-arm scenes validate {word}`"
 

@@ -92,6 +92,7 @@ class UrdfRobot:
     name: str
     links: dict[str, UrdfLink]
     joints: dict[str, UrdfJoint]
+    shapes: int = 0  # that links are drawn as, and which are left out
 
 
 def read_robot(source: str | Path) -> UrdfRobot:
@@ -115,6 +116,7 @@ def read_robot(source: str | Path) -> UrdfRobot:
         name=root.get("name", "").strip() or "robot",
         links={link.name: link for link in links},
         joints={joint.name: joint for joint in joints},
+        shapes=len(root.findall("link/visual")),
     )
 
 

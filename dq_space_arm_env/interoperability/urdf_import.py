@@ -127,7 +127,7 @@ def scene_from_urdf(
         "name": robot.name if name is None else name,
         "description": f"From the URDF of {robot.name}: the base frame, at the center of mass of {fixed}, is "
         f"at ({center}) m in {frame}.",
-        "base": {"mass": arm.base.mass, "inertia": tidied(arm.base.inertia).tolist()},
+        "base": {"mass": _rounded(arm.base.mass), "inertia": tidied(arm.base.inertia).tolist()},
         "links": _links(arm, joint_torque, passive, dampers),
         "tip_link": tip_link,
         "tip": written_pose(arm.tip),
@@ -258,7 +258,7 @@ def _link(
     driven = joint.name not in passive
     return {
         "name": joint.child,
-        "mass": part.body.mass,
+        "mass": _rounded(part.body.mass),
         "inertia": tidied(part.body.inertia).tolist(),
         "center_of_mass": tidied(part.body.center_of_mass).tolist(),
         "joint": written_pose(part.pose),
@@ -267,3 +267,8 @@ def _link(
         "torque_limit": (joint.effort or joint_torque) if driven else None,
         "damping": joint.damping if dampers else 0.0,
     }
+
+
+def _rounded(mass: float) -> float:
+    """15 digits of a mass, without the residue of a sum, as `tidied` numbers have them."""
+    return float(f"{mass:.15g}")

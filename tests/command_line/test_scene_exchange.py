@@ -260,6 +260,24 @@ def test_joints_beside_the_arm_are_named(here: Path, capsys: pytest.CaptureFixtu
     assert "beside" not in capsys.readouterr().out
 
 
+def test_shapes_that_are_left_out_are_counted_and_absent_limits_named(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = '<visual><geometry><sphere radius="1"/></geometry></visual>'
+    text = Path(ARM).read_text(encoding="utf-8")
+    drawn = text.replace("</link>", f"{shape}</link>").replace('type="revolute"', 'type="continuous"')
+    drawn = re.sub("velocity=[^ /]*", "", drawn)
+    Path("arm.urdf").write_text(drawn, encoding="utf-8")
+    assert main(["scenes", "import", "arm.urdf", "--tip", "hand", *CARRIED, *AS_IT_IS]) == SUCCESS
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"shapes left out: {text.count('</link>')}; edit geometry" in printed
+    assert "joints without limits of the angle or the rate; constraints of kind joint_limits" in printed
+    assert main(["scenes", *HAND, *CARRIED, *AS_IT_IS]) == SUCCESS
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "shapes" not in printed
+    assert re.search("joints [12] with limits of the angle", printed)
+
+
 def test_all_links_without_mass_are_named(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = re.sub(r"<inertial>.*?</inertial>", "", Path(ARM).read_text(encoding="utf-8"), flags=re.DOTALL)
     Path("arm.urdf").write_text(text, encoding="utf-8")

@@ -134,6 +134,13 @@ def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
         scene_from_urdf(text, "arm")
 
 
+def test_masses_of_lumped_bodies_have_no_residue_of_rounding():
+    joints = [joint(name, "arm", name, "fixed") + link(name, body("0.7")) for name in ("b", "c")]
+    text = robot(*GOOD[:2], link("arm", body("0.7")), *joints)
+    assert 0.7 + 0.7 + 0.7 != 2.1
+    assert scene_from_urdf(text, "arm").links[0].mass == 2.1
+
+
 def test_fixed_joints_are_none_to_lock():
     text = robot(*GOOD, joint("f", "arm", "b", "fixed"), B, joint("g", "b", "c"), link("c"))
     for name in ("f", "j1"):
