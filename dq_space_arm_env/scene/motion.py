@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, ValidationError
 
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_text
 from dq_space_arm_env.common.suggestions import did_you_mean
@@ -121,7 +121,15 @@ def _read_file(value: dict[str, Any]) -> Waypoints:
         if len(pose) != len(FILE_COLUMNS) - 1:
             raise problem(f"line {number} of {path} must be {len(FILE_COLUMNS)} numbers")
         points.append({"time": time, "pose": {"rotation": pose[:4], "position": pose[4:]}})
-    return Waypoints.model_validate({"kind": "waypoints", "points": points})
+    try:
+        return Waypoints.model_validate({"kind": "waypoints", "points": points})
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        if len(detail["loc"]) == 1:
+            raise
+        index = int(detail["loc"][1])
+        what = detail["msg"].removeprefix(f"points[{index}].")
+        raise problem(f"line {index + 2} of {path}: {what}") from None
 
 
 Motion = Annotated[ScrewMotion | Tumbling | Waypoints, BeforeValidator(_read_motion)]
