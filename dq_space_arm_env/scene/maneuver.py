@@ -168,7 +168,8 @@ class OtherTip(Model):
     goal: Pose = Field(description="desired pose of the tip in that frame, m")
     pose: StateWeights6 = Field(
         default=(15.0,) * 6,
-        description="running weight on the vector parts of the error pose, rotation then position: one or 6",
+        description="running weight on the vector parts of the error pose, rotation then position: one or "
+        "6; where the tip is on its link is `frame`",
     )
     terminal_pose: StateWeights6 = Field(
         default=(150.0,) * 6, description="terminal weight on them: one number or 6"

@@ -1,8 +1,8 @@
 """Thrusters of a scene, one by one, and their tank; allocation of forces and torques to them."""
 
 import math
-from collections.abc import Iterator
-from typing import Annotated, Any
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,8 @@ STANDARD_GRAVITY = 9.80665
 
 class Thruster(Model):
     """A thruster fixed to the base, which only pushes: its gas leaves against its force."""
+
+    _other_words: ClassVar[Mapping[str, str]] = {"limit": "force"}
 
     name: Name | None = Field(default=None, description="name of the thruster; absent: its number")
     position: Position = Field(description="where the force acts, in the base frame, m")

@@ -72,6 +72,8 @@ class Model(BaseModel):
 
     # Keys that a model's own "before" validator turns into fields.
     _other_keys: ClassVar[tuple[str, ...]] = ()
+    # Names of the same in other models, by which it may be asked for here.
+    _other_words: ClassVar[Mapping[str, str]] = {}
 
     @model_validator(mode="wrap")
     @classmethod
@@ -137,7 +139,8 @@ def _sentence(model: type[Model], detail: ErrorDetails) -> str:
     if kind == "extra_forbidden":
         known = [*model.model_fields, *model._other_keys]
         here = f"known keys here: {', '.join(known)}"
-        return f"unknown key; {did_you_mean(str(location[-1]), known, here)}"
+        word = str(location[-1])
+        return f"unknown key; {did_you_mean(model._other_words.get(word, word), known, here)}"
     known_sentence = _SENTENCES.get(kind)
     return known_sentence(detail.get("ctx", {})) if known_sentence else detail["msg"]
 

@@ -173,6 +173,7 @@ def test_names_limits_and_weights_are_those_of_the_jets() -> None:
         ({"force": np.inf, "minimum_on_time": 0.1}, "the largest force is not finite"),
         ({"minimum_on_time": 0.11}, "never fires: with the largest force a time step has an impulse of"),
         ({"minimum_impulse": 5.0}, "never fires"),
+        ({"limit": 2.0}, r"thrusters\[0\].limit: unknown key; did you mean 'force'\?"),
     ],
 )
 def test_thrusters_that_do_not_fit_are_refused(jet: dict[str, Any], sentence: str) -> None:

@@ -321,6 +321,11 @@ def test_no_other_tip_hides_a_frame(name: str) -> None:
         scene.replace(other_tips=tips)
 
 
+def test_a_tip_placed_by_its_weight_is_told_the_key_of_its_place() -> None:
+    with pytest.raises(SceneError, match=r"other_tips\[0\]\.pose = .* 6 numbers, .* on its link is `frame`"):
+        load_scene("dual-arm").replace({"other_tips.0.pose": {"position": [0, 0, 0.25]}})
+
+
 def test_no_link_has_the_name_of_the_base(data: dict[str, Any]) -> None:
     links = [{**data["links"][0], "name": "base"}, *data["links"][1:]]
     with pytest.raises(SceneError, match=r"links\[0\]\.name = 'base': is the spacecraft's: rename the link"):
