@@ -291,7 +291,7 @@ def _goals(scene: Scene) -> Iterator[tuple[str, tuple[float, ...], float]]:
 
 
 def _caught(scene: Scene) -> Iterator[str]:
-    """A payload that is not the tumbling body from which a catch takes it: the momentum would jump."""
+    """A payload that is not the body that tumbles until it is caught: its momentum changes freely."""
     motion, payload, grasp = scene.target.motion, scene.payload, scene.target.grasp
     catches = any(phase.catch is not None for phase in scene.phases)
     if not catches or payload is None or not isinstance(motion, Tumbling):
@@ -302,7 +302,7 @@ def _caught(scene: Scene) -> Iterator[str]:
     if (apart := float(np.linalg.norm(center))) > _ALIKE * gyration:
         yield (
             f"payload.center_of_mass: {apart:.3g} m from the target's origin, about which the body tumbles "
-            "until it is caught: the momentum jumps at the catch; "
+            "until it is caught: its momentum changes without a force; "
             f"{_shown(-turn.T @ grasp.position)} is there"
         )
     held, free = turn @ inertia @ turn.T, np.array(motion.inertia)
@@ -311,7 +311,7 @@ def _caught(scene: Scene) -> Iterator[str]:
         found = rows if np.any(held - np.diag(np.diag(held))) else _shown(np.diag(held))
         yield (
             "target.motion.inertia: not in the ratios of payload.inertia, turned by target.grasp: the body "
-            "tumbles as another than is caught, and the momentum jumps at the catch; "
+            "tumbles as another than is caught, and the momentum of that one changes without a torque; "
             f"{found} is the payload's"
         )
 

@@ -301,7 +301,7 @@ def test_goals_of_other_tips_out_of_reach_are_warned_of_too() -> None:
         (
             {"payload.center_of_mass": [0.5, 0.4, 0]},
             [
-                r"payload.center_of_mass: 0.427 m from the target's origin, .* momentum jumps at the catch; "
+                r"payload.center_of_mass: 0.427 m from the target's origin, .* changes without a force; "
                 r"\[0.35, 0, 0\] is there$"
             ],
         ),
