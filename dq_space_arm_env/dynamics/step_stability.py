@@ -83,7 +83,7 @@ def stable(scene: Scene) -> Scene:
     Returns:
         The scene itself, or one with integrator `rodas4`.
     """
-    unstable = _used(scene) > _MARGIN and _may_be_stiff(scene)
+    unstable = _used(scene) > _MARGIN and INTEGRATORS[STIFF].takes(scene)
     return scene.replace(simulation={"integrator": STIFF}) if unstable else scene
 
 
@@ -108,15 +108,8 @@ def advice(scene: Scene) -> str | None:
         )
         if rate > 0.0
     ]
-    stiff = f"integrator to {STIFF}, or " if _may_be_stiff(scene) else ""
+    stiff = f"integrator to {STIFF}, or " if INTEGRATORS[STIFF].takes(scene) else ""
     return (
         f"joints {' and '.join(parts)}, where {simulation.integrator} is unstable in steps of "
         f"{simulation.dt:g} s: set simulation.{stiff}dt to {_MARGIN * simulation.dt / used:.2g}"
     )
-
-
-def _may_be_stiff(scene: Scene) -> bool:
-    """Whether the integrator for stiff joints takes the scene's."""
-    entry = INTEGRATORS[STIFF]
-    turns = entry.turns_quaternions or not any(link.is_spherical for link in scene.links)
-    return turns and (scene.actuators.tank is None or not entry.keeps_momentum)

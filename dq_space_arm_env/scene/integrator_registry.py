@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf, isinf
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,12 @@ class IntegratorEntry:
     def within(self, tolerance: float) -> dict[str, float]:
         """Keys of `simulation` for a tolerance; an absolute one beside a relative one is its hundredth."""
         return {key: 0.01 * tolerance if key == "atol" else tolerance for key in self.tolerances}
+
+    def takes(self, scene: Any) -> bool:
+        """Whether the method integrates a scene's robot: spherical joints and burnt propellant limit it."""
+        spherical = any(link.is_spherical for link in scene.links)
+        burns = scene.actuators.tank is not None
+        return (self.turns_quaternions or not spherical) and not (burns and self.keeps_momentum)
 
     @property
     def is_stiff(self) -> bool:

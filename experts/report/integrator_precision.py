@@ -140,12 +140,21 @@ _Variant = tuple[str, Kernels, float | None]
 def _variants(scene: Scene) -> Iterator[_Variant]:
     """Each integrator with its kernels; adaptive ones with several tolerances."""
     for name, entry in INTEGRATORS.items():
+        if not entry.takes(scene):
+            continue
         if not entry.is_adaptive:
             yield name, compile_scene(scene), None
             continue
         for tolerance in ACCURACIES:
             changes = {"integrator": name, **entry.within(tolerance)}
             yield name, compile_scene(scene.replace(simulation=changes)), tolerance
+
+
+def left_out(scene: Scene) -> list[str]:
+    """A sentence that names the integrators that do not take the scene's robot, if any."""
+    names = [name for name, entry in INTEGRATORS.items() if not entry.takes(scene)]
+    reason = "they do not take spherical joints or propellant that burns"
+    return [f"Left out: {', '.join(names)}; {reason}."] if names else []
 
 
 def _step_times(
@@ -217,6 +226,7 @@ def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
         "Reference: the method of order 8 in short steps, or a stiff one where that fails; another one ends "
         f"{reference['uncertainty']:.0e} m or rad from there, as which smaller errors count."
     )
+    made.notes += left_out(scene)
     own = [row for row in points if row["integrator"] == scene.simulation.integrator]
     if own:
         error, tolerance = own[0]["error"], own[0]["tolerance"]

@@ -29,7 +29,7 @@ from dq_space_arm_env.scene import INTEGRATORS, Scene
 from dq_space_arm_env.scene.bodies import freedoms
 from experts.problems.shooting_problem import FloatArray
 from experts.report.effort import Announce, Effort
-from experts.report.integrator_precision import tip_error
+from experts.report.integrator_precision import left_out, tip_error
 
 CLOSE = 0.01
 """An integrator holds while the tip ends within so many m and rad."""
@@ -59,8 +59,9 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
         springs = {"N m/rad" if link.unit == "rad" else "N/m" for link in scene.links if link.freedoms == 1}
         searches.append(("stiffness", " or ".join(sorted(springs)), _vibration(scene), 1.0, _STIFFNESS_RANGE))
     rows: list[Row] = []
-    for index, integrator in enumerate(INTEGRATORS):
-        announce(integrator, index, len(INTEGRATORS))
+    integrators = [name for name, entry in INTEGRATORS.items() if entry.takes(scene)]
+    for index, integrator in enumerate(integrators):
+        announce(integrator, index, len(integrators))
         for quantity, unit, holds, first, (low, high) in searches:
             ratio = effort.ratio**2 if quantity == "stiffness" else effort.ratio
             found = largest(partial(holds, integrator), first, low, high, ratio)
@@ -246,6 +247,7 @@ def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
         f"These are limits of short motions and small swings: longer spins, and stiff joints that swing by "
         f"more than {DEFLECTION:g} rad, fail earlier."
     )
+    made.notes += left_out(scene)
 
     def draw() -> bytes:
         from experts.figures.plots import Plot

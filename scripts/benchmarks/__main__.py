@@ -1,7 +1,7 @@
 """Measure the project against its declared bounds, and against its peers where they are installed.
 
-Exit status: 0; 1 if something is less accurate than declared, with a sentence for each shortcoming; 2 if the
-input is unusable; 130 if interrupted. Times are shown, never judged.
+Exit status: 0; 1 if something is less accurate than declared, or an error ended a benchmark, with a sentence
+for each shortcoming; 2 if the input is unusable; 130 if interrupted. Times are shown, never judged.
 """
 
 from __future__ import annotations

@@ -20,13 +20,13 @@ from dq_space_arm_env.common.host_machine import processors
 from dq_space_arm_env.common.tables import Column
 from experts.report.part_costs import moving_states
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.harness import Benchmark, Row, Table, claim, note, time_column
+from scripts.benchmarks.harness import Benchmark, Row, Table, claim, note, one_by_one, time_column
 from scripts.benchmarks.subjects import (
-    COMPARED_INTEGRATORS,
     GRADIENT,
     STEP,
     Case,
     Subject,
+    compared_integrators,
     kernel_case,
     time_cases,
 )
@@ -47,8 +47,11 @@ def measure(effort: Effort) -> Iterator[Row]:
     # Beside an accelerator, the processor is none of `jax.devices()`.
     devices = dict.fromkeys([jax.devices("cpu")[0], jax.devices()[0]])
     for name in effort.scenes or ("paper",):
-        for integrator in COMPARED_INTEGRATORS:
-            yield from _measure_step(jax, load_scene(name), integrator, list(devices), effort)
+        scene = load_scene(name)
+        for integrator in compared_integrators(scene):
+            yield from one_by_one(
+                f"scene {name}", _measure_step(jax, scene, integrator, list(devices), effort)
+            )
 
 
 def _measure_step(

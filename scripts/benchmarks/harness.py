@@ -30,6 +30,7 @@ from scripts.benchmarks.effort import Effort
 Row = dict[str, Any]
 CLAIMS, NOTES = "claims", "notes"
 _LONGEST_NOTE = 240
+_LOG = logging.getLogger(__name__)
 
 
 class Status(StrEnum):
@@ -146,6 +147,13 @@ def _draw(picture: Picture, rows: Sequence[Row]) -> bytes:
     return Plot(**picture.plot).png(rows)
 
 
+def _verdict(sections: Iterable[Section]) -> str:
+    """The sentence where no claim failed."""
+    claimed = sum(sum(section.record["counts"].values()) for section in sections)
+    judged = f"All of {claimed:,} claims are as declared." if claimed else "Nothing was claimed."
+    return f"{judged} Times are shown, never judged."
+
+
 def time_column(key: str, heading: str | None = None) -> Column:
     return Column(key, heading, three_digits)
 
@@ -175,8 +183,23 @@ _CLAIMS_TABLE = Table(
 )
 
 
-def collect(benchmark: Benchmark, effort: Effort, console: Console) -> tuple[list[Row], bool]:
-    """Measure; an interrupt keeps the rows so far, and is the second result. An error is a failed claim."""
+def one_by_one(subject: str, rows: Iterable[Row]) -> Iterator[Row]:
+    """The rows of one scene or part; an error ends these with a failed claim, not those of the others."""
+    try:
+        yield from rows
+    except Exception as error:
+        _LOG.exception(subject)
+        yield _failure(subject, f"ended by {type(error).__name__}: {error}")
+
+
+def collect(
+    benchmark: Benchmark, effort: Effort, console: Console, *, alone: bool = True
+) -> tuple[list[Row], bool]:
+    """Measure; an interrupt keeps the rows so far, and is the second result.
+
+    An error is a failed claim, but for one before the first row of the only benchmark, which loses nothing:
+    unusable input.
+    """
     rows: list[Row] = []
     with console.status(f"Measuring: {benchmark.name}") as status:
         try:
@@ -187,20 +210,22 @@ def collect(benchmark: Benchmark, effort: Effort, console: Console) -> tuple[lis
         except KeyboardInterrupt:
             return rows, True
         except Exception as error:
-            if not rows:
-                raise  # nothing is lost: unusable input, a missing package
+            if alone and not rows:
+                raise
             console.print_exception()
-            rows.append(_failure(benchmark, f"ended by {type(error).__name__}: {error}"))
-    return rows or [_failure(benchmark, "nothing was measured: no case fits the settings")], False
+            rows.append(_failure(benchmark.name, f"ended by {type(error).__name__}: {error}"))
+    return rows or [_failure(benchmark.name, "nothing was measured: no case fits the settings")], False
 
 
-def _failure(benchmark: Benchmark, sentence: str) -> Row:
+def _failure(subject: str, sentence: str) -> Row:
     """A claim that a run has not met."""
-    return claim("run", "to the end", benchmark.name, None, None, note=sentence, status=Status.FAILED)
+    return claim("run", "to the end", subject, None, None, note=sentence, status=Status.FAILED)
 
 
 def run(benchmarks: Sequence[Benchmark], effort: Effort, folder: Path, console: Console) -> int:
     """Measure, print, and write a JSON file for each benchmark and the page `report` after each.
+
+    A benchmark that an error ends does not end the others.
 
     Returns the exit status: 0; 1 if a claim failed; 130 if interrupted.
     """
@@ -211,17 +236,20 @@ def run(benchmarks: Sequence[Benchmark], effort: Effort, folder: Path, console: 
         "DQ Space Arm: benchmarks",
         [],
         provenance(*packages),
-        "All results are as accurate as declared. Times are shown, never judged.",
-        "Less accurate than declared",
+        complaint="Not as declared",
     )
     for benchmark in benchmarks:
         started = perf_counter()
-        rows, interrupted = collect(benchmark, effort, console)
-        page.sections.append(section_of(benchmark, rows, effort))
-        record = {**page.sections[-1].record, **page.origin}
+        rows, interrupted = collect(benchmark, effort, console, alone=len(benchmarks) == 1)
+        section = section_of(benchmark, rows, effort)
+        if interrupted:
+            section.shortcomings.append(f"{benchmark.name}: interrupted, the rest is not measured")
+        page.sections.append(section)
+        page.all_well = _verdict(page.sections)
+        record = {**section.record, "shortcomings": section.shortcomings, **page.origin}
         write_atomically(folder / f"{benchmark.name.replace('-', '_')}.json", to_json(json_value(record)))
         page.save(folder)
-        page.sections[-1].print(console)  # last: nobody may be there to read it
+        section.print(console)  # last: nobody may be there to read it
         console.print(f"{benchmark.title}: {perf_counter() - started:.0f} s", markup=False)
         if interrupted:
             console.print("Interrupted: the measurements so far are saved.")

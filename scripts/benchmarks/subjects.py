@@ -19,6 +19,7 @@ import numpy as np
 
 from dq_space_arm_env import Kernels, Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.scene import INTEGRATORS
 from dq_space_arm_env.scene.start import number_of_draws
 from experts.report.part_costs import finite_limits, moving_states
 from experts.report.timing import time_in_turns
@@ -32,6 +33,11 @@ EPISODES = "gradient of episodes, by decision"
 GOALS = "goal environment step"
 FLOAT64, FLOAT32 = "float64", "float32"
 COMPARED_INTEGRATORS = ("symplectic_euler", "rk4")  # integrators that other engines and solvers have as well
+
+
+def compared_integrators(scene: Scene) -> tuple[str, ...]:
+    """Those of `COMPARED_INTEGRATORS` that take a scene's robot."""
+    return tuple(name for name in COMPARED_INTEGRATORS if INTEGRATORS[name].takes(scene))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +122,11 @@ def kernel_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
     Gradients, by reverse mode and by Jacobians, are timed in double precision on one thread alone.
     """
     chosen = scene.simulation.integrator
-    programs = [(DYNAMICS, ""), *((STEP, name) for name in COMPARED_INTEGRATORS), (ENVIRONMENT, chosen)]
+    programs = [
+        (DYNAMICS, ""),
+        *((STEP, name) for name in compared_integrators(scene)),
+        (ENVIRONMENT, chosen),
+    ]
     cases = []
     for what, integrator in programs:
         for variant, way in ((PLAIN, SCALAR), *((variant, VECTOR) for variant in VARIANTS)):
@@ -197,7 +207,7 @@ def function_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
         count = kernels.operation_count("forward_dynamics")
         dynamics = Subject(what=DYNAMICS, engine=OURS, way=FUNCTION, batch=batch, operations=count)
         cases.append(Case(dynamics, partial(kernels.forward_dynamics, x, u)))
-        for name in COMPARED_INTEGRATORS:
+        for name in compared_integrators(scene):
             count = kernels.operation_count("step", integrator=name)
             step = Subject(
                 what=STEP, engine=OURS, way=FUNCTION, integrator=name, batch=batch, operations=count
@@ -222,14 +232,14 @@ SYNCHRONOUS, SYNCHRONOUS_COPIES = "SyncVectorEnv", 64
 def environment_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
     """Single environments and vector environments of each size, with each integrator, and in each variant."""
     chosen, steps = scene.simulation.integrator, scene.simulation.steps
-    cases = []
-    for integrator in COMPARED_INTEGRATORS:
+    compared, cases = compared_integrators(scene), []
+    for integrator in compared:
         for way in (UNWRAPPED, MAKE):
             env = gymnasium.make("DQSpaceArm-v0", scene=PLAIN.scene(scene, integrator))
             subject = Subject(what=ENVIRONMENT, engine=OURS, way=way, integrator=integrator)
             cases.append(single_case(subject, env if way == MAKE else env.unwrapped, steps))
     for variant in VARIANTS:
-        for integrator in COMPARED_INTEGRATORS if variant == PLAIN else (chosen,):
+        for integrator in compared if variant == PLAIN else (chosen,):
             for batch in batch_sizes:
                 subject = Subject(
                     what=ENVIRONMENT,

@@ -15,7 +15,18 @@ from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, UNUSA
 from dq_space_arm_env.common.files import json_value
 from scripts.benchmarks import __main__ as command
 from scripts.benchmarks.effort import QUICK, STANDARD, Effort, Sampling
-from scripts.benchmarks.harness import Benchmark, Picture, Row, Status, Table, claim, note, run, section_of
+from scripts.benchmarks.harness import (
+    Benchmark,
+    Picture,
+    Row,
+    Status,
+    Table,
+    claim,
+    note,
+    one_by_one,
+    run,
+    section_of,
+)
 
 
 @pytest.mark.parametrize(
@@ -83,6 +94,45 @@ def test_files_and_exit_status(
     assert found["effort"]["name"] == "quick"
     assert found["machine"]["processor_name"]
     assert "Made up" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_an_error_ends_neither_the_other_benchmarks_nor_the_other_scenes(tmp_path: Path) -> None:
+    def refuse() -> Iterator[Row]:
+        yield note("Begun.")
+        raise ValueError("no such joint")
+
+    def measure(effort: Effort) -> Iterator[Row]:
+        yield from one_by_one("scene odd", refuse())
+        yield from ROWS
+
+    refused = benchmark([], ends=ValueError("spherical"))
+    chosen = [refused, replace(refused, name="other", measure=measure)]
+    assert run(chosen, QUICK, tmp_path, Console(file=StringIO(), width=120)) == FAILURE
+    found = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert found["shortcomings"] == [
+        "run: to the end, made-up: ended by ValueError: spherical",
+        "run: to the end, scene odd: ended by ValueError: no such joint",
+    ]
+    assert found["parts"]["other"]["counts"]["handled"] == 1
+    with pytest.raises(ValueError, match="spherical"):  # alone: unusable input
+        run([refused], QUICK, tmp_path, Console(file=StringIO(), width=120))
+
+
+@pytest.mark.parametrize(
+    ("rows", "ends", "said"),
+    [
+        (ROWS, None, "All of 2 claims are as declared. Times are shown, never judged."),
+        (ROWS[:4], None, "Nothing was claimed. Times are shown, never judged."),
+        (ROWS, KeyboardInterrupt(), "made-up: interrupted, the rest is not measured"),
+    ],
+)
+def test_the_verdict_tells_how_much_was_judged(
+    tmp_path: Path, rows: list[Row], ends: BaseException | None, said: str
+) -> None:
+    run([benchmark(rows, ends=ends)], QUICK, tmp_path, Console(file=StringIO(), width=120))
+    assert said in (tmp_path / "report.md").read_text(encoding="utf-8")
+    found = json.loads((tmp_path / "made_up.json").read_text(encoding="utf-8"))
+    assert found["shortcomings"] == ([] if ends is None else [said])
 
 
 class Unread(StringIO):

@@ -12,6 +12,7 @@ from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.kernels.programs.environment_programs import EnvironmentPrograms
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 from experts.report.scene_variants import feature_variants
+from scripts.benchmarks import subjects
 from scripts.benchmarks.effort import QUICK, Sampling
 from scripts.benchmarks.harness import Row, select, shortcomings
 from scripts.benchmarks.scene_cost.mechanisms import mechanism_rows
@@ -107,6 +108,33 @@ def test_sizes_of_scenes_are_those_of_kernels_and_environment(name: str) -> None
     assert (size["observations"],) == env.observation_space.shape
     assert size["environment_operations"] == kernels.operation_count("environment_step")
     assert size["step_operations"] == size[f"{scene.simulation.integrator}_operations"]
+
+
+@pytest.fixture(scope="module")
+def shoulder() -> Scene:
+    """A link on a spherical joint."""
+    (link, *_) = load_scene("no-wrist").model_dump(mode="json")["links"]
+    links = [{**link, "joint_type": "spherical"}]
+    return load_scene("no-wrist").replace(name="shoulder", links=links, initial_state={}, spread={})
+
+
+def test_integrators_that_do_not_take_a_scene_are_left_out_of_its_sizes(shoulder: Scene) -> None:
+    size = size_row(shoulder)
+    assert size["symplectic_euler_operations"] is None
+    assert size["rk4_operations"] == size["step_operations"]
+
+
+def test_integrators_that_do_not_take_a_scene_are_not_timed(
+    shoulder: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def untimed(scene: Scene, what: str, integrator: str, *others: object) -> subjects.Case:
+        return subjects.Case(subjects.Subject(what=what, engine="", way="", integrator=integrator), int)
+
+    monkeypatch.setattr(subjects, "kernel_case", untimed)
+    monkeypatch.setattr(subjects, "VARIANTS", (subjects.PLAIN,))
+    timed = [*subjects.kernel_cases(shoulder, (1,)), *subjects.function_cases(shoulder, (1,))]
+    timed += subjects.environment_cases(shoulder, (1,))
+    assert {case.subject.integrator for case in timed} == {"", "rk4"}
 
 
 def test_single_precision_halves_the_memory() -> None:

@@ -178,6 +178,18 @@ def test_the_reference_follows_inputs_and_wrist() -> None:
     assert errors["base_linear_velocity_error_m_s"] < 1e-12
 
 
+def test_a_missing_package_is_told_and_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work_precision, "find_spec", lambda name: None)
+    (row,) = work_precision.measure(SHORT)
+    assert row["note"].startswith("The references need scipy and mpmath: pip install")
+
+
+def test_only_integrators_that_take_the_robot_follow_its_motion() -> None:
+    still = np.zeros(1)
+    case = MotionCase("up", "Made up", load_scene("heavy-wrist"), still, still[None], 1.0, 1, 1e-8)
+    assert [method.name for method in methods_of(case)] == ["rk4", "rk6", "rk8", "dormand_prince"]
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_cases_move(name: str) -> None:
     case = make_case(name, 1.0)

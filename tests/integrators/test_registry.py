@@ -4,7 +4,7 @@ import pytest
 
 from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.integrators.method import TwiceDifferentiableIntegrator
-from dq_space_arm_env.scene import INTEGRATORS, Simulation
+from dq_space_arm_env.scene import INTEGRATORS, SceneError, Simulation, load_scene
 from dq_space_arm_env.scene.simulation import TOLERANCES
 
 
@@ -18,3 +18,21 @@ def test_an_entry_says_of_its_method_what_is_so(name):
     assert entry.is_adaptive == any(hasattr(method, key) for key in TOLERANCES["float64"])
     tableau = getattr(method, "tableau", None)
     assert tableau is None or tableau.order == entry.order
+
+
+@pytest.mark.parametrize("name", ["paper", "heavy-wrist", "burning"])
+def test_an_entry_takes_the_scenes_that_may_name_it(name):
+    if name == "burning":
+        jet = {"position": [0, 0, -0.4], "direction": [0, 0, 1], "force": 5, "specific_impulse": 220}
+        actuators = {"base_force": None, "thrusters": [jet], "tank": {"propellant": 5.0}}
+        scene = load_scene("paper").replace(actuators=actuators)
+    else:
+        scene = load_scene(name)
+    allowed = []
+    for integrator in INTEGRATORS:
+        try:
+            allowed.append(scene.replace(simulation={"integrator": integrator}).simulation.integrator)
+        except SceneError:
+            continue
+    assert [integrator for integrator, entry in INTEGRATORS.items() if entry.takes(scene)] == allowed
+    assert len(allowed) < len(INTEGRATORS) or name == "paper"

@@ -158,6 +158,21 @@ def test_spherical_joints_are_on_no_springs() -> None:
     assert not holds("rk4", 1e7)
 
 
+def test_integrators_that_do_not_take_the_scene_are_left_out_and_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene, able = load_scene("heavy-wrist"), ["rk4", "rk6", "rk8", "dormand_prince"]
+    variants = integrator_precision._variants(scene)
+    assert list(dict.fromkeys(name for name, _, _ in variants)) == able
+    for motion in ("_slow_motion", "_fast_motion", "_vibration"):
+        monkeypatch.setattr(stability_envelope, motion, lambda scene: lambda integrator, value: True)
+    found = stability_envelope.measure(scene, EFFORT, announce)
+    assert list(dict.fromkeys(row["integrator"] for row in found["envelope"])) == able
+    monkeypatch.setattr(Section, "add_figure", lambda *given: None)
+    assert "symplectic_euler, rodas4, rodas5p" in stability_envelope.section(scene, found).notes[-1]
+    assert integrator_precision.left_out(load_scene("paper")) == []
+
+
 @pytest.mark.parametrize("name", ["motors", "elastic-joints", "wheels"])
 def test_swings_have_no_time_constant_but_that_of_the_springs(name: str) -> None:
     """The search varies steps in place of stiffness: friction, elastic gears and wheels must be out of it."""

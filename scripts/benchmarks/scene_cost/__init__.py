@@ -12,7 +12,7 @@ from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.tables import Column
 from experts.report.scene_variants import feature_variants
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, time_column
+from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, one_by_one, time_column
 from scripts.benchmarks.scene_cost.installation import installation_rows
 from scripts.benchmarks.scene_cost.mechanisms import mechanism_rows
 from scripts.benchmarks.scene_cost.preparations import preparation_rows
@@ -29,8 +29,8 @@ def measure(effort: Effort) -> Iterator[Row]:
     names = effort.shipped(effort.cost_scenes)
     first = load_scene(effort.scenes[0]) if effort.scenes else paper
     scenes = {name: load_scene(name) for name in dict.fromkeys((REFERENCE, *names))}
-    yield from scene_rows("scenes", scenes, effort, vector=True)
-    yield from scene_rows("parts", feature_variants(first), effort, vector=False)
+    yield from one_by_one("scenes", scene_rows("scenes", scenes, effort, vector=True))
+    yield from one_by_one("parts", scene_rows("parts", feature_variants(first), effort, vector=False))
     yield from mechanism_rows(paper)
     yield from output_rows(first, effort.compilations)
     yield from process_rows(effort.processes, derivatives=effort.slow_cases)

@@ -105,14 +105,15 @@ def size_row(scene: Scene, repeats: int = 1) -> Row:
         "dynamics_operations": trace_program(scene, "forward_dynamics").operation_count,
     }
     for name in COMPARED_INTEGRATORS:
-        row[f"{name}_operations"] = trace_program(scene, "step", name).operation_count
+        takes = INTEGRATORS[name].takes(scene)
+        row[f"{name}_operations"] = trace_program(scene, "step", name).operation_count if takes else None
     for name, prefix in (("step", "step"), ("environment_step", "environment")):
         program = program_row(scene, name, integrator, repeats)
         row |= {f"{prefix}_{key}": value for key, value in program.items()}
     return row
 
 
-def scene_rows(table: str, scenes: Mapping[str, Scene], effort: Effort, *, vector: bool) -> list[Row]:
+def scene_rows(table: str, scenes: Mapping[str, Scene], effort: Effort, *, vector: bool) -> Iterator[Row]:
     """Sizes of scenes by title, and times in float64 on one thread, with ratios to the first of them.
 
     Times are taken in turns, which makes them comparable.
@@ -131,7 +132,7 @@ def scene_rows(table: str, scenes: Mapping[str, Scene], effort: Effort, *, vecto
         if "whole_steps_ns" in row:
             row["of_whole_steps"] = row["make_vec_ns"] / row["whole_steps_ns"]
         rows.append(row)
-    return rows
+        yield row
 
 
 def _cases(scene: Scene, vector: bool) -> list[Case]:

@@ -13,7 +13,7 @@ constrained     random starts of scenes with constraints, beside IPOPT and fatro
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from time import perf_counter
 
 from dq_space_arm_env import Scene, load_scene
@@ -25,7 +25,7 @@ from experts.problems.arm_problem import ArmProblem, as_problem
 from experts.problems.shooting_problem import FloatArray
 from experts.receding_horizon import RecedingHorizonExpert
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, note, time_column
+from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, note, one_by_one, time_column
 from scripts.benchmarks.solvers.accuracy import NOMINAL_START, compare_solvers, contenders
 from scripts.benchmarks.solvers.constrained import measure_constrained
 from scripts.benchmarks.solvers.iterations import measure_iterations
@@ -35,7 +35,7 @@ from scripts.benchmarks.solvers.random_starts import draw_starts, measure_starts
 from scripts.benchmarks.solvers.receding import measure_flights
 from scripts.benchmarks.solvers.runs import GAPS, Search
 from scripts.benchmarks.solvers.tracking import measure_tracking
-from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
+from scripts.benchmarks.subjects import compared_integrators
 
 ITERATIONS, ACCURACY, STARTS, HORIZON, MISMATCH, TRACKING, OWN, CONSTRAINED = PARTS = (
     "iterations",
@@ -64,25 +64,7 @@ def measure(effort: Effort) -> Iterator[Row]:
         if HORIZON in parts:
             RecedingHorizonExpert(scene)
     for scene in scenes:
-        if ITERATIONS in parts:
-            for integrator in COMPARED_INTEGRATORS:
-                yield from measure_iterations(ArmProblem(scene, integrator), effort)
-        if ACCURACY in parts or STARTS in parts:
-            problem = _warm_problem(scene)
-            guided = GuidedDDP(problem, max_iterations=effort.max_iterations)
-            started = perf_counter()
-            guided.prepare()
-            seconds = perf_counter() - started
-            yield note(
-                f"GuidedDDP solved the nominal start of scene {scene.name} beforehand in {seconds:.2g} s; "
-                "it is compared from random starts only."
-            )
-            if ACCURACY in parts:
-                yield from _compare(problem, guided, effort)
-            if STARTS in parts:
-                yield from measure_starts(problem, guided, seconds, effort)
-        if HORIZON in parts:
-            yield from measure_flights(ArmProblem(scene), effort)
+        yield from one_by_one(f"scene {scene.name}", _measure_scene(scene, parts, effort))
     if MISMATCH in parts and effort.other_masses:
         yield from measure_mismatches(effort)
     if TRACKING in parts:
@@ -91,6 +73,29 @@ def measure(effort: Effort) -> Iterator[Row]:
         yield from measure_own_problems(effort)
     if CONSTRAINED in parts:
         yield from measure_constrained(effort)
+
+
+def _measure_scene(scene: Scene, parts: Sequence[str], effort: Effort) -> Iterator[Row]:
+    """Measure the parts that every scene has."""
+    if ITERATIONS in parts:
+        for integrator in compared_integrators(scene):
+            yield from measure_iterations(ArmProblem(scene, integrator), effort)
+    if ACCURACY in parts or STARTS in parts:
+        problem = _warm_problem(scene)
+        guided = GuidedDDP(problem, max_iterations=effort.max_iterations)
+        started = perf_counter()
+        guided.prepare()
+        seconds = perf_counter() - started
+        yield note(
+            f"GuidedDDP solved the nominal start of scene {scene.name} beforehand in {seconds:.2g} s; "
+            "it is compared from random starts only."
+        )
+        if ACCURACY in parts:
+            yield from _compare(problem, guided, effort)
+        if STARTS in parts:
+            yield from measure_starts(problem, guided, seconds, effort)
+    if HORIZON in parts:
+        yield from measure_flights(ArmProblem(scene), effort)
 
 
 def _compare(problem: ArmProblem, guided: GuidedDDP, effort: Effort) -> Iterator[Row]:
@@ -106,7 +111,7 @@ def _compare(problem: ArmProblem, guided: GuidedDDP, effort: Effort) -> Iterator
         return
     chosen = problem.scene.simulation.integrator
     states = draw_starts(problem, effort.compared_starts, effort.seed)
-    for integrator in dict.fromkeys((*COMPARED_INTEGRATORS, chosen)):
+    for integrator in dict.fromkeys((*compared_integrators(problem.scene), chosen)):
         same = integrator == chosen
         variant = problem if same else _warm_problem(problem.scene, integrator)
         entrants, notes = contenders(variant, guided if same else None, effort)

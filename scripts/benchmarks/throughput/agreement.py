@@ -12,7 +12,6 @@ from experts.report.part_costs import moving_states
 from scripts.benchmarks.harness import Row, claim
 from scripts.benchmarks.peers import Peer
 from scripts.benchmarks.subjects import (
-    COMPARED_INTEGRATORS,
     FLOAT32,
     FLOAT64,
     OURS,
@@ -20,6 +19,7 @@ from scripts.benchmarks.subjects import (
     SCALAR,
     VECTOR,
     Variant,
+    compared_integrators,
 )
 
 STATES, STEPS = 64, 64
@@ -48,7 +48,7 @@ def agreements(scene: Scene, peers: Sequence[Peer]) -> Iterator[Row]:
     float32, float64 = f"{OURS}, {FLOAT32}", f"{OURS}, {FLOAT64}"
     error = _relative(single.forward_dynamics(x, u).astype(FLOAT64), ours)
     yield _agreement(scene, ACCELERATIONS, float32, float64, error)
-    for integrator in COMPARED_INTEGRATORS:
+    for integrator in compared_integrators(scene):
         own = _end_angles(kernels, x, integrator, STEPS, dt)
         rounded = _end_angles(single, x, integrator, STEPS, dt)
         for peer in (None, *peers):

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dq_space_arm_env import Scene, load_scene
 from experts.report.part_costs import moving_states
 from scripts.benchmarks.effort import Effort, Sampling
-from scripts.benchmarks.harness import Row, note, select
+from scripts.benchmarks.harness import Row, note, one_by_one, select
 from scripts.benchmarks.peers import peers_of
 from scripts.benchmarks.peers.mujoco_peer import WRAPPED, MujocoPeer
 from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
@@ -63,7 +63,7 @@ def measure(effort: Effort) -> Iterator[Row]:
     yield from peaks
     rates = {row["precision"]: row["operations_per_ns"] for row in peaks}
     for name in effort.scenes or ("paper",):
-        yield from measure_scene(load_scene(name), effort, rates)
+        yield from one_by_one(f"scene {name}", measure_scene(load_scene(name), effort, rates))
 
 
 def measure_scene(scene: Scene, effort: Effort, peaks: Mapping[str, float]) -> Iterator[Row]:

@@ -13,9 +13,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 
+from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.tables import Column
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, time_column
+from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, note, one_by_one, time_column
 
 FORMULATIONS, SCENES = "formulations", "scenes"  # parts besides the motions
 MANEUVER_TOLERANCES = (1e-3, 1e-6, 1e-9)  # of adaptive integrators in the maneuvers of scenes
@@ -26,11 +27,11 @@ def measure(effort: Effort) -> Iterator[Row]:
     """Follow the motions and the maneuvers, and compare the formulations."""
     missing = [name for name in ("scipy", "mpmath") if find_spec(name) is None]
     if missing:
-        needed = " and ".join(missing)
-        raise ModuleNotFoundError(f'the references need {needed}: pip install "dq-space-arm[test]"')
+        yield note(f'The references need {" and ".join(missing)}: pip install "dq-space-arm[test]".')
+        return
     from scripts.benchmarks.work_precision.formulations import measure_formulations
-    from scripts.benchmarks.work_precision.measurement import measure_case, rows_of
-    from scripts.benchmarks.work_precision.motions import CASES, make_case, scene_case
+    from scripts.benchmarks.work_precision.measurement import maneuver_rows, measure_case, rows_of
+    from scripts.benchmarks.work_precision.motions import CASES, make_case
 
     parts = effort.only or (*effort.motions, SCENES, FORMULATIONS)
     for part in parts:
@@ -38,8 +39,11 @@ def measure(effort: Effort) -> Iterator[Row]:
             yield from measure_formulations(effort)
         elif part == SCENES:
             brief = replace(effort, most_steps=effort.maneuver_steps, tolerances=MANEUVER_TOLERANCES)
-            for name in effort.shipped(effort.maneuvers):
-                yield from rows_of(measure_case(scene_case(name), brief))
+            names = effort.shipped(effort.maneuvers)
+            for name in names:
+                load_scene(name)  # an unusable one is refused before the first is measured
+            for name in names:
+                yield from one_by_one(f"scene {name}", maneuver_rows(name, brief))
         elif part in CASES:
             result = measure_case(make_case(part, effort.duration), effort)
             yield from rows_of(result, all_methods=not effort.methods)

@@ -25,7 +25,7 @@ from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim
 from scripts.benchmarks.subjects import OURS, STEP, Case, Subject, time_cases
 from scripts.benchmarks.work_precision.methods import Method, Walk, methods_of
-from scripts.benchmarks.work_precision.motions import DEFAULT_ACCURACY, MotionCase
+from scripts.benchmarks.work_precision.motions import DEFAULT_ACCURACY, MotionCase, scene_case
 from scripts.benchmarks.work_precision.references import Reference, reference_of
 
 SINGLE_ROWS = 256  # timed steps of a single motion in a row
@@ -304,6 +304,11 @@ def default_at_step(result: Result) -> Row | None:
     if good:
         return min(good, key=lambda point: float(point["batch_us_per_s"]))
     return min(near, key=lambda point: float(point["error"]), default=None)
+
+
+def maneuver_rows(name: str, effort: Effort) -> Iterator[Row]:
+    """Follow the expert's maneuver in a scene."""
+    yield from rows_of(measure_case(scene_case(name), effort))
 
 
 def rows_of(result: Result, *, all_methods: bool = True) -> Iterator[Row]:

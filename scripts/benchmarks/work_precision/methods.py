@@ -62,12 +62,16 @@ class Method:
 
 
 def methods_of(case: MotionCase, names: Sequence[str] = ()) -> list[Method]:
-    """The methods that follow a motion: all integrators and the paper's form, or those named."""
+    """The methods that follow a motion: integrators that take its robot, the paper's form; or those named."""
     known = (*INTEGRATORS, *PAPER_TITLES)
     for name in names:
         if name not in known:
             raise ValueError(f"methods: {name!r} is unknown; choose from {', '.join(known)}")
-    methods = [Method(name, method.order, method.is_adaptive) for name, method in INTEGRATORS.items()]
+    methods = [
+        Method(name, entry.order, entry.is_adaptive)
+        for name, entry in INTEGRATORS.items()
+        if entry.takes(case.scene)
+    ]
     if case.with_paper_form:
         methods += [Method(name, INTEGRATORS["rk4"].order) for name in PAPER_TITLES]
     return [method for method in methods if not names or method.name in names]
