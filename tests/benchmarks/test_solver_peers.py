@@ -1,5 +1,6 @@
 """The same maneuver in other solvers: steps, costs and optima that agree; what is said where they cannot."""
 
+from itertools import count
 from typing import Any
 
 import casadi
@@ -15,7 +16,7 @@ from experts import BoxDDP
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import PaperProblem
 from experts.problems.shooting_problem import FloatArray
-from scripts.benchmarks.peers import crocoddyl_maneuver, crocoddyl_peer
+from scripts.benchmarks.peers import crocoddyl_maneuver, crocoddyl_peer, interior_point_peer
 from scripts.benchmarks.peers.crocoddyl_maneuver import CrocoddylManeuver
 from scripts.benchmarks.peers.crocoddyl_peer import solve_with_crocoddyl
 from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
@@ -82,6 +83,15 @@ def test_ipopt_takes_another_start_and_a_guess_of_states_and_controls(short_scen
         check_record(run, problem, start)
     assert warm.costs[0] < 1.1 * plan.cost < cold.costs[0]
     assert warm.iterations < cold.iterations
+
+
+def test_the_clock_of_ipopt_runs_from_the_call_on(
+    short_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It counts how often it is read: once in each callback, and once after it, which is not counted."""
+    solver = InteriorPoint(ArmProblem(short_scene), max_iterations=2)
+    monkeypatch.setattr(interior_point_peer, "perf_counter", count().__next__)
+    assert solver.solve().seconds.tolist() == [0.0, 2.0, 3.0]
 
 
 def test_ipopt_says_when_iterations_or_time_are_used_up(short_scene: Scene) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import Scene
+from dq_space_arm_env.common.tables import Column
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from experts import BoxDDP, GuidedDDP
 from experts.ddp.second_order import SecondOrder
@@ -15,7 +16,7 @@ from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import QUICK
 from scripts.benchmarks.harness import Row, select, shortcomings
-from scripts.benchmarks.solvers import _compare, constrained, random_starts, receding
+from scripts.benchmarks.solvers import BENCHMARK, _compare, constrained, random_starts, receding
 from scripts.benchmarks.solvers import accuracy as contenders_module
 from scripts.benchmarks.solvers.accuracy import OURS, Contender, best_costs, compare_solvers, contenders
 from scripts.benchmarks.solvers.iterations import measure_iterations
@@ -123,6 +124,19 @@ def test_guided_runs_begin_with_the_policy_of_the_library(problem: ArmProblem, g
     assert run.costs[0] < zero.costs[0]
     assert (np.diff(run.costs) <= 0.0).all()
     assert run.replayed_cost == pytest.approx(guided.solve(start).cost, rel=1e-12)
+
+
+def test_iterations_in_long_steps_take_time_but_have_no_cost_of_the_problem(problem: ArmProblem) -> None:
+    solver = GuidedDDP(problem, coarsening=4)
+    (start,) = draw_starts(problem, 1, seed=0)
+    long_steps = solver.solve(start).metadata["long_steps"]
+    run = guided_ddp(problem, solver)(start)
+    before = sum(attempt["iterations"] for attempt in long_steps)
+    assert 0 < before < run.iterations
+    assert set(run.costs[: before + 1]) == {run.costs[0]}
+    assert run.costs[before + 1] < run.costs[0]
+    assert run.costs[-1] == pytest.approx(run.replayed_cost, rel=1e-6)
+    assert len(run.costs) == len(run.seconds) == run.iterations + 1
 
 
 def test_other_problems_are_measured_by_their_own_best(problem: ArmProblem, guided: GuidedDDP) -> None:
@@ -324,6 +338,9 @@ def test_flights_have_every_horizon_and_disturbance(problem: ArmProblem) -> None
     assert flights[0]["cost"] == pytest.approx(flights[0]["open_loop_cost"], rel=1e-5)
     assert len(select(rows, table="claims")) == 2
     assert shortcomings(rows) == []
+    (shown, *_) = (table for table in BENCHMARK.tables if table.name == "flights")
+    named = {each.key: each.title for each in shown.columns if isinstance(each, Column)}
+    assert [named[key].split()[0] for key in ("attitude_error_deg", "position_error_m")] == ["largest"] * 2
 
 
 @pytest.mark.slow

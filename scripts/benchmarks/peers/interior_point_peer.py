@@ -95,7 +95,7 @@ class InteriorPoint:
         return SolverRun(
             solver=self._solver_name,
             costs=costs,
-            seconds=np.array(seconds) - seconds[0],
+            seconds=np.array([0.0, *seconds[1:]]),  # the guess is there from the call on
             iterations=int(stats["iter_count"]),
             converged=bool(stats["success"]),
             stop_reason=str(stats["return_status"]),

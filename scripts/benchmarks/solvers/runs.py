@@ -146,24 +146,29 @@ def _timed_run(
 ) -> SolverRun:
     """Solve with a clock; where several guesses are solved, the costs are the lowest so far.
 
-    The first cost is that of zero controls by default.
+    The first cost is that of zero controls by default. It stands through the iterations in long steps, which
+    take time but are of another problem.
     """
     if first_cost is None:
         first_cost = _cost(problem, np.zeros((problem.horizon, problem.n_controls)), x0)
-    costs, stamps, records = [first_cost], [0.0], []
+    stamps: list[float] = [0.0]
+    records: list[IterationRecord] = []
     started = perf_counter()
 
     def look_at_clock(record: IterationRecord) -> None:
         stamps.append(perf_counter() - started)
-        costs.append(min(costs[-1], record.cost))
         records.append(record)
 
     solution = uninterrupted(solve(callback=look_at_clock))
+    attempts = solution.metadata.get("attempts")  # in the problem's own steps, which come last
+    own = len(records) if attempts is None else sum(attempt["iterations"] for attempt in attempts)
+    in_long_steps = len(records) - own
+    costs = [first_cost] * (in_long_steps + 1) + [record.cost for record in records[in_long_steps:]]
     fields = {"derivatives": "derivative_seconds", "sweep": "sweep_seconds", "rollout": "rollout_seconds"}
     parts = {part: median_ms([getattr(record, name) for record in records]) for part, name in fields.items()}
     return SolverRun(
         solver=name,
-        costs=np.array(costs),
+        costs=np.minimum.accumulate(costs),
         seconds=np.array(stamps),
         iterations=len(records),
         converged=solution.converged,
