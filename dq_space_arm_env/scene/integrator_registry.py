@@ -52,6 +52,11 @@ class IntegratorEntry:
         """Keys of `simulation` for a tolerance; an absolute one beside a relative one is its hundredth."""
         return {key: 0.01 * tolerance if key == "atol" else tolerance for key in self.tolerances}
 
+    @property
+    def iterates(self) -> bool:
+        """Whether a step repeats passes until they converge, fewer in a shorter one: an implicit method."""
+        return self.is_stiff and not self.is_adaptive
+
     def takes(self, scene: Any) -> bool:
         """Whether the method integrates a scene's robot: spherical joints and burnt propellant limit it."""
         spherical = any(link.is_spherical for link in scene.links)

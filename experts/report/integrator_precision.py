@@ -33,7 +33,7 @@ BATCH = 1024
 LOST = 1.0
 """Beyond this error of the tip, m or rad, a motion has nothing to do with the right one."""
 _FAR_OFF = 1e6  # entries of a diverged state
-_TIMED_STEP = 8  # steps per input in the runs that are timed
+_TIMED_STEP = 8  # steps per input in the runs that are timed, of methods that do not iterate
 _FINEST_REFERENCE = 64  # steps per input
 _AGREEMENT = 1e-12  # m, rad; of the reference with half its steps
 _ASYMPTOTIC, _ROUNDING = 1e-3, 1e-11  # errors that show an order of convergence lie between
@@ -110,13 +110,14 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
     end, uncertainty = reference_end(motion)
     announce("times of the integrators", 2, 4)
     variants = list(_variants(motion.scene))
-    times = _step_times(motion, variants, effort)
+    times = list(_step_times(motion, variants, effort))
     announce("errors of the integrators", 3, 4)
     # No error is known better than the reference, which is itself a motion of this list.
     least = uncertainty if uncertainty < LOST else 0.0
     points: list[Row] = []
-    for (integrator, kernels, tolerance), (single, batch) in zip(variants, times, strict=True):
+    for (integrator, kernels, tolerance), found in zip(variants, times, strict=True):
         for per_hold in (1,) if tolerance is not None else effort.steps_per_input:
+            single, batch = found.get(per_hold) or found[_TIMED_STEP]
             step = motion.scene.simulation.dt / per_hold
             error = max(tip_error(kernels, motion.end(kernels, integrator, per_hold), end), least)
             points.append(
@@ -159,18 +160,25 @@ def left_out(scene: Scene) -> list[str]:
 
 def _step_times(
     motion: Motion, variants: Sequence[_Variant], effort: Effort
-) -> Iterator[tuple[float, float]]:
-    """Times of a step of one motion, and of each of a batch on one core, ns."""
+) -> Iterator[dict[int, tuple[float, float]]]:
+    """Times of a step of one motion, and of each of a batch on one core, ns, by steps per input.
+
+    A step of a method that does not iterate takes the same, however long it is: one is timed.
+    """
     runs: list[Callable[[], object]] = []
+    timed: list[tuple[int, ...]] = []
     for integrator, kernels, tolerance in variants:
-        per_hold = _TIMED_STEP if tolerance is None else 1
-        step = motion.scene.simulation.dt / per_hold
-        call = step_call(kernels, integrator, *_along(motion, kernels, BATCH), step)
-        runs += [partial(motion.end, kernels, integrator, per_hold), partial(call, BATCH)]
-    samples = time_in_turns(runs, effort.repeats, effort.sample_seconds)
-    for (_, _, tolerance), single, batch in zip(variants, samples[::2], samples[1::2], strict=True):
-        steps = len(motion.controls) * (_TIMED_STEP if tolerance is None else 1)
-        yield single.best_ns / steps, batch.best_ns / BATCH
+        lengths = effort.steps_per_input if INTEGRATORS[integrator].iterates else (_TIMED_STEP,)
+        timed.append((1,) if tolerance is not None else lengths)
+        along = _along(motion, kernels, BATCH)
+        for per_hold in timed[-1]:
+            call = step_call(kernels, integrator, *along, motion.scene.simulation.dt / per_hold)
+            runs += [partial(motion.end, kernels, integrator, per_hold), partial(call, BATCH)]
+    samples = iter(time_in_turns(runs, effort.repeats, effort.sample_seconds))
+    for lengths in timed:
+        pairs = ((per_hold, next(samples).best_ns, next(samples).best_ns) for per_hold in lengths)
+        steps = len(motion.controls)
+        yield {count: (single / (steps * count), batch / BATCH) for count, single, batch in pairs}
 
 
 def step_call(

@@ -275,6 +275,14 @@ def test_every_integrator_shows_its_order_on_the_free_body(body: Result) -> None
     assert min(point["error"] for point in rk4.points) < 1e-12
 
 
+def test_steps_of_a_method_that_iterates_are_timed_at_each_length(body: Result) -> None:
+    of_a_step = {
+        curve.method.name: {round(1e3 * each["batch_us_per_s"] * each["step_s"], 6) for each in curve.points}
+        for curve in body.curves
+    }
+    assert len(of_a_step["gauss6"]) > 1 == len(of_a_step["rk4"])
+
+
 @pytest.mark.slow
 def test_the_paper_form_follows_the_maneuver_and_projection_keeps_the_joints_together() -> None:
     case = make_case("maneuver", 0.6)

@@ -87,6 +87,15 @@ def test_the_error_of_the_own_integrator_is_told_with_its_tolerance(
     assert told in integrator_precision.section(own, found).notes[-1]
 
 
+def test_steps_of_a_method_that_iterates_are_timed_at_each_length(precision: dict) -> None:
+    def step_times(name: str) -> set[float]:
+        points = [point for point in precision["points"] if point["integrator"] == name]
+        return {round(point["single_us"] * point["step_s"], 12) for point in points}
+
+    assert len(step_times("gauss6")) > 1 == len(step_times("rk4"))
+    assert [name for name, entry in INTEGRATORS.items() if entry.iterates] == ["gauss6"]
+
+
 def test_the_reference_is_more_precise_than_what_it_judges(precision: dict) -> None:
     assert precision["reference"][0]["uncertainty"] < 1e-11
     assert precision["reference"][0]["duration_s"] == pytest.approx(3.0)

@@ -48,8 +48,8 @@ _ROUNDING = 1e-9  # below, an error that no longer falls with the step is due to
 _LONG_RUN_SECONDS = 0.05
 
 
-_Times = dict[tuple[str, float | None], tuple[float, float]]
-"""ns per step of a single motion and of one of a batch, by method and tolerance."""
+_Times = dict[tuple[str, float | None, int], tuple[float, float]]
+"""ns per step of a single motion and of one of a batch, by method, tolerance, and steps per hold."""
 
 
 @dataclass
@@ -57,7 +57,7 @@ class Curve:
     """A method on a motion."""
 
     method: Method
-    step_ns: tuple[float, float]  # of a single motion, and of one of a batch; of the finest tolerance
+    step_ns: tuple[float, float]  # of a single motion, and of one of a batch; of the finest tolerance or step
     points: list[Row] = field(default_factory=list)  # coarsest first
     lost: list[float] = field(default_factory=list)  # steps [s] or tolerances that lose the motion
     long_run_ratio: float | None = None  # time of a whole run over that of its steps
@@ -98,7 +98,7 @@ def measure_case(case: MotionCase, effort: Effort) -> Result:
     curves = [
         _adaptive_curve(method, case, reference, times, effort)
         if method.is_adaptive
-        else _stepped_curve(method, case, reference, times[method.name, None], effort)
+        else _stepped_curve(method, case, reference, times, effort)
         for method in methods
     ]
     return Result(case, reference.source, uncertainty, curves, [*_estimates(case, reference, effort)])
@@ -138,14 +138,14 @@ def _adaptive_curve(
     method: Method, case: MotionCase, reference: Reference, times: _Times, effort: Effort
 ) -> Curve:
     """The longest steps, with smaller and smaller tolerances."""
-    curve = Curve(method, times[method.name, effort.tolerances[-1]])
+    curve = Curve(method, times[method.name, effort.tolerances[-1], case.coarsest])
     for tolerance in effort.tolerances:
         kernels = method.kernels(case.scene, tolerance)
         walk = Walk(method, kernels, case)
         walk.run(case.coarsest)
         errors = errors_of(kernels, walk.state, reference.state)
         if errors["error"] < LOST:
-            time_ns = times[method.name, tolerance]
+            time_ns = times[method.name, tolerance, case.coarsest]
             curve.points.append(_point(method, case, case.coarsest, errors, time_ns, tolerance))
         else:
             curve.lost.append(tolerance)
@@ -153,10 +153,11 @@ def _adaptive_curve(
 
 
 def _stepped_curve(
-    method: Method, case: MotionCase, reference: Reference, times: tuple[float, float], effort: Effort
+    method: Method, case: MotionCase, reference: Reference, times: _Times, effort: Effort
 ) -> Curve:
     """Shorter and shorter steps, until rounding dominates."""
-    curve, kernels = Curve(method, times), method.kernels(case.scene)
+    finest = times[method.name, None, max(_ladder(case, effort))]
+    curve, kernels = Curve(method, finest), method.kernels(case.scene)
     walk = Walk(method, kernels, case)
     for per_hold in _ladder(case, effort):
         began = time.perf_counter()
@@ -166,9 +167,10 @@ def _stepped_curve(
         if not errors["error"] < LOST:
             curve.lost.append(case.hold / per_hold)
             continue
-        curve.points.append(_point(method, case, per_hold, errors, times, None))
+        time_ns = times.get((method.name, None, per_hold), finest)
+        curve.points.append(_point(method, case, per_hold, errors, time_ns, None))
         if seconds > _LONG_RUN_SECONDS:
-            curve.long_run_ratio = 1e9 * seconds / (curve.points[-1]["steps"] * times[0])
+            curve.long_run_ratio = 1e9 * seconds / (curve.points[-1]["steps"] * time_ns[0])
         if is_rounding([point["error"] for point in curve.points]):
             break
     return curve
@@ -231,15 +233,17 @@ def _estimates(case: MotionCase, reference: Reference, effort: Effort) -> Iterat
 def _step_times(
     methods: Sequence[Method], case: MotionCase, passed: tuple[FloatArray, FloatArray], effort: Effort
 ) -> _Times:
-    """Times of steps, of all methods in turns."""
-    keys: list[tuple[str, float | None]] = []
+    """Times of steps, of all methods in turns; of a method that does not iterate, any step takes the same."""
+    keys: list[tuple[str, float | None, int]] = []
     cases: list[Case] = []
+    ladder = list(_ladder(case, effort))
     for method in methods:
         for tolerance in effort.tolerances if method.is_adaptive else (None,):
-            keys.append((method.name, tolerance))
-            per_hold = case.coarsest if method.is_adaptive else max(_ladder(case, effort))
             kernels = method.kernels(case.scene, tolerance)
-            cases += _step_cases(method, kernels, case, passed, per_hold)
+            timed = [case.coarsest] if method.is_adaptive else ladder if method.iterates else ladder[-1:]
+            for per_hold in timed:
+                keys.append((method.name, tolerance, per_hold))
+                cases += _step_cases(method, kernels, case, passed, per_hold)
     timings = [timing["best_ns"] for timing in time_cases(cases, effort.step_timing)]
     return dict(zip(keys, zip(timings[::2], timings[1::2], strict=True), strict=True))
 

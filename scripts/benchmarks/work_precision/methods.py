@@ -35,6 +35,11 @@ class Method:
         return PAPER_TITLES.get(self.name, self.name)
 
     @property
+    def iterates(self) -> bool:
+        """Whether the work of a step depends on how long it is, though no tolerance divides it."""
+        return not self.is_paper_form and INTEGRATORS[self.name].iterates
+
+    @property
     def is_paper_form(self) -> bool:
         """Whether its state is the paper's."""
         return self.name in PAPER_TITLES
