@@ -12,6 +12,7 @@ from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Column, Row
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.scene import Scene
+from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem
@@ -27,12 +28,25 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
     announce("the scene's own start", 0, starts + 1)
     expert = GuidedDDP(scene, max_iterations=effort.max_iterations)
     expert.prepare()  # now, so that it does not count as time of the first start
+    compile_constraints(expert)
     env = DQSpaceArmEnv(scene)
     rows: list[Row] = []
     for seed in range(starts):
         announce(f"start {seed}", seed + 1, starts + 1)
         rows.append(solve_episode(expert, env, seed))
     return {"starts": rows}
+
+
+def compile_constraints(expert: GuidedDDP) -> None:
+    """Compile what leads a maneuver to the target: `prepare` leaves it to the first start that needs it.
+
+    No maneuver is within no tolerance, a reserve of 1: all of it is needed.
+    """
+    problem = cast(ArmProblem, expert.problem)
+    if problem.constraints is None:  # its tolerances become some
+        for each in (problem, *map(problem.coarsened, expert.coarsening)):
+            exacting, model = each.constrained(reserve=1.0), expert.second_order
+            uninterrupted(BoxDDP(exacting, max_iterations=50, second_order=model).solve())
 
 
 def solve_episode(expert: GuidedDDP, env: DQSpaceArmEnv, seed: int) -> Row:

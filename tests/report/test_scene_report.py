@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from dq_space_arm_env.command_line import main
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Row
+from dq_space_arm_env.kernels.library import KernelLibrary
 from dq_space_arm_env.scene import INTEGRATORS
 from experts import BoxDDP, GuidedDDP
 from experts.problems.arm_problem import ArmProblem
@@ -251,6 +253,29 @@ def test_starts_are_those_of_the_seeds(drawing: Scene) -> None:
     assert [row["seed"] for row in rows] == [0, 1, 2]
     assert rows[2]["cost"] == pytest.approx(expected.cost, rel=1e-9)
     assert all(row["converged"] and row["success"] for row in rows)
+
+
+def test_a_start_that_is_led_to_the_target_compiles_nothing(
+    spread_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its seconds are those of the solve."""
+    loaded, load, solve = [], KernelLibrary._load, expert_trials.solve_episode
+
+    def loading(library: KernelLibrary, name: str, *others: Any) -> Any:
+        loaded.append(name)
+        return load(library, name, *others)
+
+    def led(*given: Any) -> Row:
+        monkeypatch.setattr(ArmProblem, "is_success", lambda *given: False)
+        loaded.clear()
+        return solve(*given)
+
+    monkeypatch.setattr(KernelLibrary, "_load", loading)
+    monkeypatch.setattr(expert_trials, "solve_episode", led)
+    own = spread_scene.replace(simulation={"steps": 48})  # of which no other test has kernels
+    expert_trials.measure(own, Effort(starts=1), announce)
+    of_the_row = "tip_errors"  # after the solve
+    assert [name for name in loaded if not name.startswith("environment_")] == [of_the_row]
 
 
 def test_success_is_that_of_the_environment_where_the_target_moves(short_scene: Scene) -> None:

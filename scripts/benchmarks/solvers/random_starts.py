@@ -18,7 +18,7 @@ from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
-from experts.report.expert_trials import solve_episode
+from experts.report.expert_trials import compile_constraints, solve_episode
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim
 from scripts.benchmarks.solvers.runs import GUIDED, relative_gap
@@ -46,6 +46,7 @@ def measure_starts(
 ) -> Iterator[Row]:
     """Solve episodes; then a summary of the scene, and the claims. The preparation took so many seconds."""
     scene = problem.scene.name
+    compile_constraints(guided)
     env, judge = DQSpaceArmEnv(problem.scene), _judge(problem, guided, effort)
     rows: list[Row] = []
     for seed in range(effort.seed, effort.seed + effort.starts):
