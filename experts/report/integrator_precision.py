@@ -38,6 +38,8 @@ _FINEST_REFERENCE = 64  # steps per input
 _AGREEMENT = 1e-12  # m, rad; of the reference with half its steps
 _ASYMPTOTIC, _ROUNDING = 1e-3, 1e-11  # errors that show an order of convergence lie between
 _FLOORS, _UNCERTAINTIES, _SLOPES = 6.0, 30.0, 3
+LARGEST_FLOOR = 1e-8
+"""Errors that stop falling above it, m or rad, have not met rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,11 +204,14 @@ def _along(motion: Motion, kernels: Kernels, count: int) -> tuple[FloatArray, Fl
 
 def observed_order(steps: Sequence[float], errors: Sequence[float], uncertainty: float = 0.0) -> float | None:
     """Order of convergence that errors at shorter and shorter steps show; None if too few show it."""
-    floor = min(errors) if errors[-1] > 0.5 * errors[-2] else 0.0  # of rounding
+    least = min(errors)
+    is_rounding = errors[-1] > 0.5 * errors[-2] and least < LARGEST_FLOOR
+    floor = least if is_rounding else 0.0
+    last = errors.index(least) if least < LARGEST_FLOOR else len(errors) - 1  # what follows is rounding
     smallest = max(_ROUNDING, _UNCERTAINTIES * uncertainty, _FLOORS * floor)
     slopes = [
         float(np.log(errors[i] / errors[i + 1]) / np.log(steps[i] / steps[i + 1]))
-        for i in range(len(steps) - 1)
+        for i in range(last)
         if errors[i] < _ASYMPTOTIC and errors[i + 1] > smallest
     ]
     return float(np.median(slopes[-_SLOPES:])) if slopes else None

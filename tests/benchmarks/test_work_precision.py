@@ -102,6 +102,8 @@ def test_the_observed_order_leaves_out_coarse_steps_and_rounding() -> None:
     assert observed_order(steps, growing) == pytest.approx(6.0)
     crossing = [error * (40.0 if k == 1 else 1.0) for k, error in enumerate(errors)]
     assert observed_order(steps, crossing) == pytest.approx(6.0)
+    chain = [2e-1, 1e-4, 1.6e-6, 2.4e-8, 3.8e-10, 6e-11, 2e-11, 4e-12, 1e-10, 3e-11]  # of gauss6
+    assert observed_order([2.0**-k for k in range(10)], chain, 1.7e-12) == pytest.approx(6.0, abs=0.1)
     assert HIGH.observed_order(None) == pytest.approx(4.0)
     assert curve("free", 4, *HIGH.points, adaptive=True).observed_order(None) is None
     assert curve("lost", 4).observed_order(None) is None
@@ -353,6 +355,16 @@ def test_shortcomings_name_what_is_inaccurate() -> None:
     assert len(shortcomings(rows_of(result(slow), all_methods=False))) == 1  # of one method, only the order
     (sentence,) = shortcomings(rows_of(result(curve("lost", 4))))
     assert sentence == "motions: up, best integrator: the error is not finite."
+
+
+@pytest.mark.parametrize("floor", [2e-3, 3e-5, 1e-7, 1e-9])
+def test_a_method_that_stops_converging_fails_its_claim(floor: float) -> None:
+    """Above rounding, wherever that is."""
+    rows = [point(0.96 / 2**k, max(0.9 / 16**k, floor), 1.0) for k in range(12)]
+    found = shortcomings(rows_of(result(curve("rk4", 4, *rows)), all_methods=False))
+    assert [sentence.partition(":")[0] for sentence in found] == ["orders"] * (floor > 1e-8)
+    few = result(curve("rk4", 4, *rows[:3]))  # steps too long to tell
+    assert shortcomings(rows_of(few, all_methods=False)) == []
 
 
 def test_a_scene_is_judged_by_its_own_integrator() -> None:

@@ -20,7 +20,14 @@ from dq_space_arm_env.kernels.adaptive import CATCH_NOW
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
-from experts.report.integrator_precision import ACCURACIES, BATCH, LOST, cheapest, observed_order
+from experts.report.integrator_precision import (
+    ACCURACIES,
+    BATCH,
+    LARGEST_FLOOR,
+    LOST,
+    cheapest,
+    observed_order,
+)
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim
 from scripts.benchmarks.subjects import OURS, STEP, Case, Subject, time_cases
@@ -46,6 +53,7 @@ _ESTIMATED, _UNCERTAINTIES = 1e-11, 30.0  # errors that an estimate can tell
 _FAR_OFF = 1e6  # entries of a lost state
 _ROUNDING = 1e-9  # below, an error that no longer falls with the step is due to rounding
 _LONG_RUN_SECONDS = 0.05
+_SHORT_ENOUGH = 1e-5  # error that steps promise which must show an order
 
 
 _Times = dict[tuple[str, float | None, int], tuple[float, float]]
@@ -68,6 +76,15 @@ class Curve:
             return None
         steps, errors = ([point[key] for point in self.points] for key in ("step_s", "error"))
         return observed_order(steps, errors, uncertainty or 0.0)
+
+    def stagnates(self, uncertainty: float | None) -> bool:
+        """Whether errors stop falling, by the order claimed much too early: that shows no order either."""
+        if self.method.is_adaptive or len(self.points) < 2:
+            return False
+        first, last = self.points[0], self.points[-1]
+        promised = first["error"] * (last["step_s"] / first["step_s"]) ** self.method.order
+        least: float = min(point["error"] for point in self.points)
+        return promised < _SHORT_ENOUGH and least > max(LARGEST_FLOOR, _UNCERTAINTIES * (uncertainty or 0.0))
 
 
 @dataclass
@@ -373,9 +390,10 @@ def rows_of(result: Result, *, all_methods: bool = True) -> Iterator[Row]:
         yield claim("motions", case.name, "best integrator", least, case.limit, unit="m, rad")
     for curve in result.curves:
         order = curve.observed_order(result.uncertainty)
-        if case.is_smooth and order is not None:
-            note = f"shows order {order:.2f}, claims {curve.method.order}"
-            missing = max(curve.method.order - order, 0.0)
+        if case.is_smooth and (order is not None or curve.stagnates(result.uncertainty)):
+            shown = "no order" if order is None else f"order {order:.2f}"
+            note = f"shows {shown}, claims {curve.method.order}"
+            missing = None if order is None else max(curve.method.order - order, 0.0)
             yield claim("orders", case.name, curve.method.title, missing, ORDER_TOLERANCE, note=note)
 
 
