@@ -96,7 +96,7 @@ BENCHMARK = Benchmark(
         Table(
             "defaults",
             "The integrator of each scene, and the cheapest that is right to 1e-4 at the scene's step, or "
-            "the most accurate\n1e-4 m and rad are a thousandth of what counts as a success",
+            "the most accurate\n1e-4 m is a thousandth of what counts as a success in scene paper",
             (
                 "case",
                 Column("dt_s", "step [s]", "g"),

@@ -18,8 +18,8 @@ from experts.ddp.solution import uninterrupted
 from experts.problems.shooting_problem import FloatArray
 
 DEFAULT_ACCURACY = 1e-4
-"""Error of the tip [m, rad] that a scene's own integrator stays below: a thousandth of the 10 cm that count
-as a success."""
+"""Error of the tip [m, rad] that a scene's own integrator stays below: a thousandth of the 10 cm within
+which scene paper succeeds."""
 STIFFNESS = 1e4  # spring of the stiff joint, N m/rad
 STIFF_JOINT = 1
 CHAIN_JOINTS = 8
