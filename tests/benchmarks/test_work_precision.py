@@ -59,7 +59,7 @@ def result(*curves: Curve, integrator: str = "rk4", step: float = 0.1, shipped: 
     scene = load_scene("planar").replace(simulation={"dt": step, "steps": 10, "integrator": integrator})
     still = np.zeros(1)
     case = MotionCase("up", "Made up", scene, still, still[None], 1.0, 1, 1e-8, has_other_code=not shipped)
-    return Result(case, "nobody", None, list(curves))
+    return Result(case, "nobody", 1e-12 if shipped else None, list(curves))
 
 
 LOW = curve("symplectic_euler", 1, *(point(0.1 / 2**k, 1e-2 / 2**k, 1.0 * 2**k) for k in range(6)))
@@ -375,6 +375,9 @@ def test_a_scene_is_judged_by_its_own_integrator() -> None:
     (sentence,) = shortcomings(rows_of(own))
     assert sentence.startswith("scenes: up, symplectic_euler: the error 1.0e-02 is above 0.0001 m, rad")
     assert shortcomings(rows_of(result(LOW, HIGH, shipped=True))) == []
+    poor = replace(result(LOW, HIGH, shipped=True), uncertainty=1e-3)
+    (sentence,) = shortcomings(rows_of(poor))
+    assert sentence.startswith("references: up, nobody: the error 1.0e-03 is above 1e-05 m, rad")
     unmeasured = result(LOW, HIGH, integrator="rk8", shipped=True)
     assert own_choice(unmeasured) is None
     assert shortcomings(rows_of(unmeasured)) == []

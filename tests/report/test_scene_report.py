@@ -122,6 +122,17 @@ def test_stiff_joints_get_a_stiff_reference(short_scene: Scene) -> None:
     assert np.isfinite(timed).all()
 
 
+def test_a_reference_on_which_no_two_methods_agree_is_refused(
+    short_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = np.array(compile_scene(short_scene).layout.initial_state)
+    motion = Motion(short_scene, start, np.zeros((1, 2)))
+    monkeypatch.setattr(Motion, "end", lambda *given: start)
+    monkeypatch.setattr(integrator_precision, "tip_error", lambda *given: 1.5)
+    with pytest.raises(ValueError, match="no two integrators follow"):
+        reference_end(motion)
+
+
 def test_integrators_follow_the_expert_through_phases() -> None:
     """What is caught weighs from then on, in shorter steps too."""
     scene = load_scene("capture-and-detumble")

@@ -50,6 +50,7 @@ ERRORS = {
 LARGEST_RATIO = 1.2
 """Largest factor by which an estimated global error may be off, up or down."""
 _ESTIMATED, _UNCERTAINTIES = 1e-11, 30.0  # errors that an estimate can tell
+_REFERENCE = 0.1 * DEFAULT_ACCURACY  # largest uncertainty of the reference of a scene's maneuver
 _FAR_OFF = 1e6  # entries of a lost state
 _ROUNDING = 1e-9  # below, an error that no longer falls with the step is due to rounding
 _LONG_RUN_SECONDS = 0.05
@@ -369,6 +370,10 @@ def rows_of(result: Result, *, all_methods: bool = True) -> Iterator[Row]:
         "best_error": best and best["error"],
     }
     if not case.has_other_code:  # the expert's maneuver in a shipped scene
+        second = "a second method ends as near to the reference"
+        yield claim(
+            "references", case.name, result.source, result.uncertainty, _REFERENCE, unit="m, rad", note=second
+        )
         if own is not None or _own_is_lost(result):
             method, error = case.scene.simulation.integrator, math.inf if own is None else own["error"]
             note = "its own integrator must follow the expert's maneuver"
