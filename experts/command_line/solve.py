@@ -53,11 +53,12 @@ def solve(
     """Solve SCENE, a name or a file, by control-limited differential dynamic programming.
 
     The output folder receives solution.npz (trajectory, controls, feedback gains), scene.yaml, summary.json,
-    and figures on request. Exit status 1: the solve did not converge; 130: interrupted. After the
-    preparation the best trajectory so far is always saved, flagged as not converged.
+    and figures on request. Exit status 1: the solve did not converge, or misses a catch; 130: interrupted.
+    After the preparation the best trajectory so far is always saved, flagged as not converged.
     """
     from dq_space_arm_env import load_scene
     from dq_space_arm_env.dynamics.step_stability import advice
+    from dq_space_arm_env.environment.catches import ends_held
     from experts.command_line import solving
 
     loaded = load_scene(scene)
@@ -86,4 +87,4 @@ def solve(
         console.print(f"{folder}: {written}", markup=False, soft_wrap=True)
     if run.interrupted:
         raise Interrupted(f"the best trajectory so far is saved in {folder}")
-    return SUCCESS if run.solution.converged else FAILURE
+    return SUCCESS if run.solution.converged and ends_held(run.catches) else FAILURE

@@ -107,6 +107,8 @@ def _verdict(run: ManeuverRun) -> str:
         return f"INTERRUPTED after {solution.iterations} iterations: this is the best trajectory so far."
     if not solution.converged:
         return f"NOT CONVERGED: {solution.message}. This is the best trajectory so far."
+    if run.replay.caught is not None and not run.replay.caught[0]:
+        return "A catch is MISSED: J is as if it were met, and the environment flies on without the payload."
     if not run.replay_agrees:
         return "The environment does not charge what the solver planned: one of them is wrong."
     return "Converged; the environment charges what the solver planned."

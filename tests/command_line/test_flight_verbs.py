@@ -301,6 +301,12 @@ def test_a_plan_that_misses_its_catch_is_no_success(
     assert re.search(r"catch, detumble +MISSED +nothing is held", capsys.readouterr().out)
     summary = json.loads(Path("results", "solutions", "short", "summary.json").read_text())
     assert (summary["missed_catches"], summary["is_success"]) == (["detumble"], False)
+    assert main(["solve", "short.yaml", "--solver", "box", "--max-iterations", "100"]) == FAILURE
+    table = capsys.readouterr().out
+    assert re.search(r"end +converged", table)
+    assert re.search(r"cost J +[\d.]+ +as if the payload were caught; ", table)
+    assert re.search(r"to meet it +let the robot coast", table)
+    assert re.search(r"within the tolerance as if\s+caught", table)
     assert main(["simulate", "short.yaml", "--policy", "zero"]) == SUCCESS
     assert "MISSED" in capsys.readouterr().out
 

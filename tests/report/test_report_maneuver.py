@@ -12,7 +12,7 @@ from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import StateLayout
-from experts.report import Maneuver, ManeuverRun, integrator_precision, replay, run_maneuver
+from experts.report import Maneuver, ManeuverRun, integrator_precision, replay, reproduction, run_maneuver
 from experts.report.effort import QUICK
 from experts.report.maneuver_run import errors_with_finer_steps
 from experts.report.maneuver_summary import print_tables, summarize
@@ -155,6 +155,12 @@ def test_replay_flies_and_charges_what_the_solver_planned(short_run: ManeuverRun
     assert short_run.replay_difference < 1e-12
     assert short_run.replay_agrees
     assert sum(short_run.cost_terms.values()) == pytest.approx(short_run.solution.cost, rel=1e-12)
+
+
+def test_a_missed_catch_is_no_contradiction_of_environment_and_solver(short_run: ManeuverRun) -> None:
+    flown = replace(short_run.replay, caught=np.array([False]))
+    missed = replace(short_run, replay=flown)
+    assert reproduction._verdict(missed).startswith("A catch is MISSED: J is as if it were met")
 
 
 def test_scenes_in_single_precision_are_replayed_in_double(short_run: ManeuverRun) -> None:
