@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dq_space_arm_env.scene.constraint_rows import Row
 from experts.ddp.end_response import EndResponse
 from experts.problems.shooting_problem import FloatArray
 from experts.problems.stage_constraints import StageConstraints
@@ -69,6 +70,8 @@ PATIENCE = 8
 """Updates without progress at the largest penalty after which a problem counts as infeasible."""
 PROGRESS = 0.9
 """Largest share of the smallest violation so far that counts as progress."""
+SUCCESS = "success: "
+"""How names of rows begin that hold a final error."""
 NOTABLE = 0.1
 """Violation, relative to the tolerance, that messages name besides the worst."""
 MOST_NAMED = 4
@@ -79,7 +82,8 @@ class ConstraintReport(NamedTuple):
     """How a trajectory keeps to its constraints.
 
     Attributes:
-        violation: Largest violation of a row with its margin, in the row's unit; negative where all are met.
+        violation: Largest residual of a row with its margin, in the row's unit; negative where all are met.
+            Of success it is (e^2 - tolerance^2) / (2 tolerance), of an error e.
         worst_row: Name of the row that has it.
         worst_time: Time at which it has it, s.
         complementarity: Sum of |l c| over all rows, relative to the cost.
@@ -91,6 +95,18 @@ class ConstraintReport(NamedTuple):
     worst_time: float
     complementarity: float
     active_share: float
+
+
+def _final_error(row: Row, residual: float) -> float:
+    """The error e of a row of success, from its residual (e^2 - t^2) / (2 t); of angles e is 2 sin(a / 2)."""
+    turns = row.unit == "rad"
+    bound = 2.0 * math.sin(0.5 * min(row.tolerance, math.pi)) if turns else row.tolerance
+    error = math.sqrt(max(bound**2 + 2.0 * bound * residual, 0.0))
+    return 2.0 * math.asin(min(0.5 * error, 1.0)) if turns else error
+
+
+def _unit(row: Row) -> str:
+    return "" if row.unit == "1" else f" {row.unit}"
 
 
 class AugmentedLagrangian:
@@ -222,10 +238,7 @@ class AugmentedLagrangian:
         return np.where(self._equalities, np.abs(residuals), np.where(self._inequalities, residuals, -np.inf))
 
     def violated(self, states: FloatArray, controls: FloatArray, time_step: float) -> str:
-        """The rows that a trajectory violates most, relative to their tolerances, the worst first, in words.
-
-        Of success, whose residuals are (e^2 - tolerance^2) / (2 tolerance), the errors e.
-        """
+        """The rows that a trajectory violates most, relative to their tolerances, worst first, in words."""
         constraints, found = self.constraints, dict[str, tuple[float, str]]()
         violations = self._violations(constraints.find(states, controls))
         for rows, block, first in (
@@ -234,16 +247,26 @@ class AugmentedLagrangian:
         ):
             for column, row in enumerate(rows):
                 stage = int(block[:, column].argmax())
-                most, unit = float(block[stage, column]), "" if row.unit == "1" else f" {row.unit}"
+                most, unit = float(block[stage, column]), _unit(row)
                 share = most / row.tolerance
                 text = f"{row.name} by {most:.2g}{unit} at {(first + stage) * time_step:.3g} s"
-                if row.name.startswith("success: "):
-                    error = math.sqrt(max(row.tolerance**2 + 2.0 * row.tolerance * most, 0.0))
+                if row.name.startswith(SUCCESS):
+                    error = _final_error(row, most)
                     text = f"{row.name} is {error:.3g}{unit}, {row.tolerance:.3g} at most"
                 if share > found.get(row.name, (0.0, ""))[0]:
                     found[row.name] = share, text
         worst, *others = sorted(found.values(), reverse=True)[:MOST_NAMED] or [(0.0, "none")]
         return "; ".join([worst[1], *(text for share, text in others if share >= NOTABLE)])
+
+    def worst(self, report: ConstraintReport) -> str:
+        """The largest violation in words, of success the error beyond its tolerance."""
+        constraints = self.constraints
+        rows = (*constraints.path, *constraints.terminal)
+        row = next(each for each in rows if each.name == report.worst_row)
+        excess = report.violation
+        if row.name.startswith(SUCCESS):
+            excess = _final_error(row, excess) - row.tolerance
+        return f"the largest violation is {excess:.1e}{_unit(row)}, of {row.name}"
 
     def report(
         self, states: FloatArray, controls: FloatArray, cost: float, time_step: float

@@ -105,7 +105,7 @@ class MultiplierMethod:
         lagrangian.leave_out()
         work.evaluate_anew()
         if report.violation > 0.0:
-            message += f"; the largest violation is {report.violation:.1e}, of {report.worst_row}"
+            message += f"; {lagrangian.worst(report)}"
         reason = stop.reason
         if reason is StopReason.REGULARIZATION_LIMIT and report.violation > SERIOUS:
             reason = StopReason.INFEASIBLE

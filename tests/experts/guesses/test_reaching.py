@@ -1,11 +1,13 @@
 """Final errors within the tolerances, at the least cost that takes: they become constraints where needed."""
 
+import re
 from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 
+from dq_space_arm_env import load_scene
 from experts import BoxDDP, GuidedDDP
 from experts.ddp.augmented_lagrangian import PATIENCE, AugmentedLagrangian
 from experts.ddp.end_response import EndResponse, end_response
@@ -156,6 +158,23 @@ def test_updates_without_progress_end_as_infeasible():
         assert not lagrangian.is_infeasible
         lagrangian.update_by_response(states, controls, EndResponse(residuals, -np.eye(len(residuals))))
     assert lagrangian.is_infeasible
+
+
+def test_a_violation_of_success_is_told_as_the_excess_over_the_tolerance():
+    scene = load_scene("planar")
+    problem = ArmProblem(scene).constrained()
+    states = np.broadcast_to(problem.initial_state, (problem.horizon + 1, problem.n_states))
+    lagrangian = AugmentedLagrangian(problem.constraints)
+    report = lagrangian.report(states, np.zeros((problem.horizon, problem.n_controls)), 1.0, 0.01)
+    error = problem.kernels.tip_errors(states[-1])[0]
+    excess = np.radians(error - scene.success.attitude_error_deg)
+    assert report.violation > 5.0 * excess  # the square's
+    told = re.fullmatch(
+        r"the largest violation is (\S+) rad, of success: attitude error", lagrangian.worst(report)
+    )
+    assert float(told.group(1)) == pytest.approx(excess, rel=0.05)
+    violated = lagrangian.violated(states, np.zeros((problem.horizon, problem.n_controls)), 0.01)
+    assert f"success: attitude error is {np.radians(error):.3g} rad" in violated
 
 
 def test_a_reserve_is_a_share_of_the_tolerances(paper, start):
