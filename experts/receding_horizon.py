@@ -105,12 +105,18 @@ class RecedingHorizonExpert:
                 scene. The first time that this happens compiles the scene with these numbers as parameters.
 
         Raises:
+            TypeError: If it is a problem.
             SceneError: If the scene cannot be loaded.
             ValueError: If a setting is too small or no whole number, or the scene has no actuators or one
                 without a limit.
         """
         check_whole("horizon", horizon, 1)
         check_whole("iterations", iterations, 0)
+        if hasattr(scene, "kernel"):
+            raise TypeError(
+                f"RecedingHorizonExpert takes scenes only, no {type(scene).__name__}: give a scene, or solve "
+                "the problem at every step, `BoxDDP(problem).solve(x, u_init)`"
+            )
         self.maneuver = ArmProblem(scene)
         as_problem(self.maneuver)
         if not np.isfinite(self.maneuver.kernels.layout.control_limit).all():

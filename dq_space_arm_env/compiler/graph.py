@@ -194,6 +194,9 @@ def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ..
             register[writes[0]] = add(Node("input", slot=(reads[0], reads[1])))
         elif operation == casadi.OP_OUTPUT:
             results[writes[1]] = register[reads[0]]
+        elif operation == casadi.OP_HYPOT:
+            first, second = (add(Node("square", (register[r],))) for r in reads)
+            register[writes[0]] = add(Node("sqrt", (add(Node("add", (first, second))),)))
         elif operation in _OPERATION_NAMES:
             register[writes[0]] = add(Node(_OPERATION_NAMES[operation], tuple(register[r] for r in reads)))
         else:

@@ -181,8 +181,12 @@ class BoxDDP:
             guess = initial_state, shooting.check(x_init), controls
             stop = shooting.close_gaps(guess, state, self.max_iterations, callback)
         if work.current.failing_stage != FINISHED:
-            message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
-            work.current.states[work.current.failing_stage + 1 :] = np.nan  # or an earlier solve's
+            failing, reached = work.current.failing_stage, work.current.states
+            culprit = "the terminal cost"
+            if failing < len(reached) - 1:
+                culprit = "the stage cost" if np.isfinite(reached[failing + 1]).all() else "the step"
+            message = f"the first rollout is not finite from stage {failing} on: {culprit} is not"
+            reached[failing + 1 :] = np.nan  # or an earlier solve's
             return self._solution(state, Stop(StopReason.DIVERGED, message), np.zeros_like(work.update.K))
         state.moved = True
         try:

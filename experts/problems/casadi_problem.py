@@ -123,7 +123,15 @@ class CasadiProblem(EuclideanProblem):
 
 def _expression(name: str, function: Function, arguments: tuple[Matrix, ...], size: int) -> Matrix:
     """The column of a function's results, checked."""
-    value: Any = function(*arguments)
+    try:
+        value: Any = function(*arguments)
+    except RuntimeError as error:
+        if "truth value" not in str(error):
+            raise
+        raise TypeError(
+            f"{name} branches on a symbol, as in `if x[0] > 0`: use "
+            "casadi.if_else(condition, if_true, if_false), or PythonProblem"
+        ) from error
     try:
         if isinstance(value, list | tuple | np.ndarray):
             value = casadi.vertcat(*value)
@@ -136,7 +144,9 @@ def _expression(name: str, function: Function, arguments: tuple[Matrix, ...], si
     if column.shape == (1, size):
         column = column.T
     if column.shape != (size, 1):
-        wanted = "a scalar" if size == 1 and name != "step" else f"{size} numbers, one for each state"
+        wanted = (
+            "a scalar" if size == 1 and name != "step" else f"{size} numbers, one for each of initial_state"
+        )
         raise ValueError(f"{name} returns an expression of shape {column.shape}; expected {wanted}")
     free = casadi.Function(name, list(arguments), [column], {"allow_free": True}).free_sx()
     if free:

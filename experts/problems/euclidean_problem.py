@@ -53,7 +53,10 @@ def runge_kutta(dynamics: Function, time_step: float) -> Function:
                 value = casadi.vertcat(*value) if isinstance(x, casadi.SX) else np.array(value)
             found, expected = _count(value), _count(x)
             if found != expected:  # one would be the rate of all
-                raise ValueError(f"dynamics returns {found} numbers; expected {expected}, one for each state")
+                raise ValueError(
+                    f"dynamics returns {found} numbers; expected {expected}, one for each state: change it "
+                    "or initial_state"
+                )
             return value
 
         k1 = rate(x)

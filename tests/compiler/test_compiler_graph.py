@@ -15,9 +15,10 @@ from dq_space_arm_env.compiler.graph import graph_of, trace
     [
         (lambda x: [0.0 * x[0] + 1.0 * x[1]], 0),
         (lambda x: [x[0] * (3.0 * 4.0)], 1),
+        (lambda x: [casadi.hypot(*x)], 4),
         (lambda x: [casadi.sin(x[0] * x[1]) + 1.0, casadi.sin(x[0] * x[1]) - 1.0], 4),
     ],
-    ids=["zeros and ones vanish", "constants fold", "common subexpressions are shared"],
+    ids=["zeros and ones vanish", "constants fold", "hypot is a root", "common subexpressions are shared"],
 )
 def test_operations_left(outputs, operations):
     assert trace("f", {"x": 2}, lambda x: {"y": outputs(x)}).operation_count == operations

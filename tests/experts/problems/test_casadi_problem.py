@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
-from experts import BoxDDP, CasadiProblem, GuidedDDP, PythonProblem, runge_kutta
+from experts import BoxDDP, CasadiProblem, GuidedDDP, PythonProblem, RecedingHorizonExpert, runge_kutta
 from scripts.examples import cart_pole as cart_pole_example
 from scripts.examples import planar_quadrotor as quadrotor_example
 from scripts.examples.cart_pole import cart_pole
@@ -225,7 +225,8 @@ def test_parameters_may_differ_from_stage_to_stage():
 @pytest.mark.parametrize(
     ("changes", "error", "sentence"),
     [
-        ({"step": lambda x, u, p: x[0]}, ValueError, r"step returns .* \(1, 1\); expected 2 numbers"),
+        ({"step": lambda x, u, p: x[0]}, ValueError, r"step returns .* expected 2 numbers, .* of initial"),
+        ({"stage_cost": lambda x, u, p: x[0] if x[0] > 0 else u[0]}, TypeError, "use casadi.if_else"),
         ({"stage_cost": lambda x, u, p: u}, ValueError, r"stage_cost returns .* expected a scalar"),
         ({"terminal_cost": lambda x, p: None}, TypeError, "terminal_cost returns NoneType"),
         ({"terminal_cost": lambda x, p: casadi.MX.sym("m")}, TypeError, "terminal_cost returns MX"),
@@ -258,8 +259,13 @@ def test_a_step_of_no_duration_is_refused(duration):
 @pytest.mark.parametrize("kind", [CasadiProblem, PythonProblem])
 def test_one_rate_is_not_spread_over_all_states(kind):
     step = runge_kutta(lambda x, u: [u[0]], 0.1)
-    with pytest.raises(ValueError, match="dynamics returns 1 numbers; expected 2, one for each state"):
+    with pytest.raises(ValueError, match=r"dynamics returns 1 numbers; expected 2, .* or initial_state"):
         kind(step, lambda x, u: u[0] ** 2, lambda x: x[0], initial_state=[0, 0], n_controls=1, horizon=3)
+
+
+def test_the_receding_horizon_takes_scenes_only():
+    with pytest.raises(TypeError, match="takes scenes only, no CasadiProblem: give a scene"):
+        RecedingHorizonExpert(small())
 
 
 def test_a_control_without_a_weight_is_refused():

@@ -239,12 +239,21 @@ def test_an_interrupt_ends_the_solve_with_its_best_trajectory(delay, no_finalize
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_numbers_that_are_not_finite_end_the_solve():
-    problem = pendulum(step=lambda x, u, p: x + (np.nan if abs(x[0]) > 2.0 else 0.0))
+@pytest.mark.parametrize(
+    ("changes", "stage", "culprit"),
+    [
+        ({"step": lambda x, u, p: x + np.nan}, 0, "the step"),
+        ({"stage_cost": lambda x, u, p: np.nan}, 0, "the stage cost"),
+        ({"terminal_cost": lambda x, p: np.nan}, "N", "the terminal cost"),
+    ],
+)
+def test_numbers_that_are_not_finite_end_the_solve_and_the_function_is_named(changes, stage, culprit):
+    problem = pendulum(**changes)
     solution = BoxDDP(problem).solve()
+    stage = problem.horizon if stage == "N" else stage
     assert (solution.stop_reason, solution.message) == (
         "diverged",
-        "the first rollout is not finite from stage 0 on",
+        f"the first rollout is not finite from stage {stage} on: {culprit} is not",
     )
 
 
