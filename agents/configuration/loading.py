@@ -14,8 +14,9 @@ from agents.configuration.imitation import ActionChunking, Cloning, Dagger, Imit
 from agents.configuration.reinforcement import Configuration
 from agents.configuration.residual import ResidualConfiguration, ResidualPPO, ResidualSAC
 from agents.configuration.schema import AgentConfiguration
+from dq_space_arm_env import SceneError, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError
-from dq_space_arm_env.common.shown_text import shortened
+from dq_space_arm_env.common.shown_text import shortened, yaml_like
 from dq_space_arm_env.validation import (
     YAMLError,
     did_you_mean,
@@ -117,15 +118,40 @@ def _read(file: Traversable) -> AgentConfiguration:
 def _of_its_class(data: Mapping[str, Any], origin: str) -> AgentConfiguration:
     algorithm = data.get("algorithm")
     name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
-    if not isinstance(name, str) or name not in _CLASSES:
-        known = f"it must be one of {', '.join(_CLASSES)}"
-        known = did_you_mean(name, _CLASSES, known) if isinstance(name, str) else known
-        raise ConfigurationError(f"{origin}: algorithm.name = {shortened(name)}: {known}")
-    return _validated(_CLASSES[name], dict(data), origin)
+    if isinstance(name, str) and name in _CLASSES:
+        return _validated(_CLASSES[name], dict(data), origin)
+    known = f"it must be one of {', '.join(_CLASSES)}"
+    known = did_you_mean(name, _CLASSES, known) if isinstance(name, str) else known
+    wrong = f"algorithm.name = {shortened(name)}: {known}"
+    if algorithm is not None and not isinstance(algorithm, Mapping):
+        example = algorithm if isinstance(algorithm, str) and algorithm in _CLASSES else "PPO"
+        wrong = f"algorithm = {yaml_like(algorithm)}: must be a mapping, as {{name: {example}}}"
+    problems = _scene_problems(data)
+    try:
+        _CommonKeys.model_validate(dict(data))
+    except ValidationError as error:
+        raise ConfigurationError(problem_list(origin, error, wrong, *problems)) from error
+    raise ConfigurationError(problem_list(origin, None, wrong, *problems))
+
+
+class _CommonKeys(AgentConfiguration, extra="ignore"):
+    """The keys of every algorithm."""
 
 
 def _validated(kind: type[AgentConfiguration], data: object, origin: str) -> AgentConfiguration:
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        raise ConfigurationError(problem_list(origin, error)) from error
+        problems = _scene_problems(data) if isinstance(data, Mapping) else ()
+        raise ConfigurationError(problem_list(origin, error, *problems)) from error
+
+
+def _scene_problems(data: Mapping[str, Any]) -> tuple[str, ...]:
+    """Tell what is wrong with the scene, which is not loaded here where the rest is right."""
+    scene = data.get("scene")
+    try:
+        if isinstance(scene, str):
+            load_scene(scene)
+    except SceneError as error:
+        return (f"scene: {str(error).splitlines()[0]}",)
+    return ()

@@ -47,6 +47,7 @@ class Practice(Model):
     reward_scale: Positive = Field(default=1.0, description="factor of rewards")
     cost_power: Positive = Field(
         default=1.0,
+        le=1.0,
         description="exponent of the mean cost of a held action, at most 1; below 1, small errors count more",
     )
     success_reward: NonNegative = Field(
@@ -60,10 +61,6 @@ class Practice(Model):
     normalize_observations: Flag = Field(
         default=True, description="whether networks see observations in units of their spread"
     )
-
-    def _problems(self) -> Iterator[Problem]:
-        if self.cost_power > 1.0:
-            yield Problem(("cost_power",), self.cost_power, "must be at most 1, the cost itself")
 
 
 class Schedule(Model):

@@ -28,7 +28,9 @@ class ResidualPractice(Model):
     )
     reward_scale: Positive = Field(default=0.02, description="factor of rewards")
     cost_power: Positive = Field(
-        default=0.5, description="exponent of the cost of a step, at most 1; below 1, small errors count more"
+        default=0.5,
+        le=1.0,
+        description="exponent of the cost of a step, at most 1; below 1, small errors count more",
     )
     memory: Positive = Field(
         default=0.3, description="time over which the agent sees deviations averaged, beside the current, s"
@@ -39,10 +41,6 @@ class ResidualPractice(Model):
         description="norm of the averaged deviation from the plan (rad, m, rad/s, m/s together) at which "
         "corrections have full authority; below it in proportion, on the plan none",
     )
-
-    def _problems(self) -> Iterator[Problem]:
-        if self.cost_power > 1.0:
-            yield Problem(("cost_power",), self.cost_power, "must be at most 1, the cost itself")
 
 
 class ResidualPPO(PPO):

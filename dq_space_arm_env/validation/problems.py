@@ -55,9 +55,10 @@ def field_path(location: Iterable[str | int]) -> str:
     return path or "scene"
 
 
-def problem_list(origin: str, error: ValidationError) -> str:
-    """List the problems of a model, a line each."""
-    problems = [detail["msg"] for detail in error.errors(include_url=False)]
+def problem_list(origin: str, error: ValidationError | None, *others: str) -> str:
+    """List other problems and those of a model, a line each."""
+    found = () if error is None else error.errors(include_url=False)
+    problems = [*others, *(detail["msg"] for detail in found)]
     count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
     more = len(problems) - _MOST_SHOWN
     rest = [f"and {more} more"] if more > 0 else []
@@ -152,5 +153,6 @@ _SENTENCES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "string_type": lambda context: "must be text; quote it if it looks like a number, a date or true/false",
     "string_too_short": lambda context: "must not be empty",
     "tuple_type": lambda context: "must be a list",
+    "less_than_equal": lambda context: f"must be at most {context['le']:g}",
     "literal_error": lambda context: f"must be {context['expected']}",
 }

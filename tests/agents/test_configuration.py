@@ -135,6 +135,18 @@ def test_wrong_values_are_named_with_what_would_be_right(changes, sentence):
     assert sentence in refusal(**changes)
 
 
+def test_all_problems_are_told_at_once():
+    message = refusal(scene="nowhere.yaml", threads="two", environment={"copies": 0, "cost_power": 2})
+    assert message.startswith("configuration 'small': 4 problems")
+    assert "- scene: nowhere.yaml: there is no such file" in message
+    assert "- environment.cost_power = 2.0: must be at most 1 (exponent" in message
+    message = refusal(scene="nowhere.yaml", threads="two", algorithm={"name": "PP0"})
+    assert message.startswith("configuration 'small': 3 problems\n  - algorithm.name = 'PP0': did you mean")
+    assert "threads = 'two'" in message
+    told = refusal(algorithm="SAC")
+    assert told.endswith("1 problem\n  - algorithm = 'SAC': must be a mapping, as {name: SAC}")
+
+
 IMITATION = {"name": "small", "algorithm": {"name": "cloning"}}
 
 
