@@ -284,6 +284,19 @@ def test_recipes_apply(title, tmp_path):
         compile((tmp_path / line).read_text(encoding="utf-8"), line, "exec")
 
 
+def test_places_of_other_additions_exist():
+    text = SECTIONS["Other additions"]
+    whats = re.findall(r"^\| (\w[\w ]+) \|", text, flags=re.MULTILINE)
+    assert whats == ["what", "kind of constraint", "cost term", "observation entry", "scene to ship"]
+    named = re.findall(r"`([^`]+)`", text)
+    places = [ROOT / name for name in named if "/" in name and " " not in name]
+    assert len(places) > 20
+    assert [place for place in places if not place.exists()] == []
+    code = "".join(place.read_text(encoding="utf-8") for place in places if place.suffix == ".py")
+    words = [name for name in named if "/" not in name]
+    assert [word for word in words if not re.search(rf"^ *(def|class)? *{word}\b", code, re.MULTILINE)] == []
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("git") is None, reason="recipes are applied by git")
 @pytest.mark.parametrize("title", RECIPES)
