@@ -285,8 +285,8 @@ def test_a_start_that_is_led_to_the_target_compiles_nothing(
     monkeypatch.setattr(expert_trials, "solve_episode", led)
     own = spread_scene.replace(simulation={"steps": 48})  # of which no other test has kernels
     expert_trials.measure(own, Effort(starts=1), announce)
-    of_the_row = "tip_errors"  # after the solve
-    assert [name for name in loaded if not name.startswith("environment_")] == [of_the_row]
+    of_the_row = {"tip_errors"}  # after the solve, unless the preparation was not kept
+    assert {name for name in loaded if not name.startswith("environment_")} <= of_the_row
 
 
 def test_success_is_that_of_the_environment_where_the_target_moves(short_scene: Scene) -> None:
