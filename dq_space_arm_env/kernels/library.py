@@ -140,9 +140,13 @@ class KernelLibrary:
         known = read_code(of_scene, scene_key)
         if known is None:
             with self._compiling(name):
-                known = _program_key(program(), lanes, self.scene.simulation.precision).encode()
-            keep_code(of_scene, scene_key, known)
-        return BoundKernel(native.load_or_build(name, known.decode(), build))
+                key = _program_key(program(), lanes, self.scene.simulation.precision)
+        else:
+            key = known.decode()
+        kernel = native.load_or_build(name, key, build)
+        if known is None:  # last: what another process finds there is ready
+            keep_code(of_scene, scene_key, key.encode())
+        return BoundKernel(kernel)
 
     @contextmanager
     def _compiling(self, name: str) -> Iterator[None]:
