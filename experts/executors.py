@@ -79,7 +79,7 @@ class ProcessExecutor:
         Raises:
             ValueError: If there are none, or it is no whole number.
         """
-        if not hasattr(workers, "__index__"):
+        if isinstance(workers, bool) or not hasattr(workers, "__index__"):
             raise ValueError(f"workers: {workers!r}, should be a whole number of at least 1")
         if workers < 1:
             raise ValueError(f"workers: {workers}, should be at least 1")
@@ -155,4 +155,4 @@ def local_executor(workers: int | None = None) -> Executor:
     """
     if workers is None:
         workers = 1 if is_worker() else processors()
-    return SerialExecutor() if workers == 1 else ProcessExecutor(workers)
+    return SerialExecutor() if workers == 1 and workers is not True else ProcessExecutor(workers)

@@ -16,6 +16,14 @@ from dq_space_arm_env.viewing.payload_places import payload_path
 from dq_space_arm_env.viewing.replay.flights import frame_poses, target_during, tip_errors
 from experts.problems.shooting_problem import FloatArray
 
+FIGURES = (
+    "figure-2-snapshots",
+    "figure-3-pose-error",
+    "figure-4-error-norms",
+    "figure-5-base-inputs",
+    "figure-6-arm-inputs",
+)
+"""Files of the paper's figures, without suffix: `experts.figures`, which needs Matplotlib, draws them."""
 _AT_LIMIT = 1.0 - 1e-9
 
 

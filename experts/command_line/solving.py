@@ -28,8 +28,9 @@ from dq_space_arm_env.common.tables import plain_table
 from dq_space_arm_env.environment.catches import Catch, ends_held
 from dq_space_arm_env.scene import StateLayout
 from experts import BoxDDP, GuidedDDP, Solution, StopReason
+from experts.maneuver import FIGURES, Maneuver
 from experts.problems.arm_problem import ArmProblem
-from experts.report import Maneuver, SolveProgress
+from experts.report import SolveProgress
 from experts.report.reproduction import results_folder
 
 AS_IF_CAUGHT = "as if the payload were caught; `dq-space-arm simulate` flies on without it"
@@ -138,8 +139,8 @@ def save(run: SolveRun, folder: Path, *, figures: bool) -> list[Path]:
         maneuver = Maneuver(run.start.episode_scene, run.solution.states, run.solution.controls)
         files += write_figures(maneuver, folder)
     else:
-        for figure in folder.glob("figure-[2-6]-*.png"):
-            figure.unlink()  # of an earlier run: it shows another trajectory
+        for name in FIGURES:  # of an earlier run: they show another trajectory
+            (folder / f"{name}.png").unlink(missing_ok=True)
     return files
 
 

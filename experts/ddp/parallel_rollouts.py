@@ -134,7 +134,10 @@ def _roll_out(
     control_upper: FloatArray,
     work: _Work,
 ) -> None:
-    """Roll out all lanes as `closed_loop_rollout` does one, without a retraction; NaN stays in its lane."""
+    """Roll out all lanes as `closed_loop_rollout` does one, without a retraction.
+
+    One that diverges goes on from the reference, so that no kernel meets a state that is not finite.
+    """
     horizon, n_x = work.controls.shape[0], work.states.shape[2]
     first_states = kernels.difference_buffers[1]
     for lane in range(LANES):
@@ -152,13 +155,17 @@ def _roll_out(
         alive = False
         for lane in range(LANES):
             work.totals[lane] += work.stage_costs[k, lane]
-            if not is_finite(work.states[k + 1, lane]):
+            if not (np.isfinite(work.totals[lane]) and is_finite(work.states[k + 1, lane])):
                 work.totals[lane] = np.inf
+                for j in range(n_x):
+                    work.states[k + 1, lane, j] = reference_states[k + 1, j]
             alive = alive or np.isfinite(work.totals[lane])
         if not alive:
             break
     kernels.difference_buffers[1] = first_states
     for lane in range(LANES):
+        if work.totals[lane] == np.inf:
+            continue
         for j in range(n_x):
             work.end_state[0, j] = work.states[horizon, lane, j]
         call_kernel(kernels.terminal, 0, 1, kernels.terminal_buffers)

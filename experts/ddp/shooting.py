@@ -31,7 +31,7 @@ from experts.ddp.derivatives import (
 )
 from experts.ddp.parallel_rollouts import LANE_KERNELS, LANES, ParallelRollouts
 from experts.ddp.rollout import FINISHED, Trajectory
-from experts.native.compilation import BufferTable, is_prepared, prepare
+from experts.native.compilation import BufferTable, has_code, is_prepared, prepare
 from experts.problems.python_problem import PythonProblem
 from experts.problems.shooting_problem import (
     KERNEL_NAMES,
@@ -137,10 +137,12 @@ class ShootingWorkspace:
         wanted = [(name, name in BATCHED_KERNELS) for name in names]
         in_lanes = [(name, True) for name in LANE_KERNELS]
         longest_first = sorted([*wanted, *in_lanes], key=lambda each: each[0] not in LONGEST_KERNELS)
+        # The types of its arguments, which take numba as long as the rest of this, are those of all problems.
+        is_new = not has_code(backward_pass)
         longest_loop = (backward_pass, *self._pass_arguments(0.0, self._gauss_newton, self._no_gaps))
-        is_missing = not is_prepared(*longest_loop)
+        is_missing = is_new and not is_prepared(*longest_loop)
         with compiling_aside(self.problem, longest_first, compile_other_loops if is_missing else None):
-            if not (is_missing and is_worker()):  # whose parent may be at it
+            if is_new and not (is_missing and is_worker()):  # whose parent may be at it
                 prepare(*longest_loop)
         return {name: self.problem.kernel(name, batched=batched) for name, batched in wanted}
 

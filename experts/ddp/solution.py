@@ -317,6 +317,13 @@ def uninterrupted(solution: Solution) -> Solution:
     return solution
 
 
+def as_interrupted(solution: Solution) -> Solution:
+    """The solution as what is there when the user interrupts, even if its own solve had ended."""
+    if solution.stop_reason is StopReason.INTERRUPTED:
+        return solution
+    return replace(solution, stop_reason=StopReason.INTERRUPTED, message="interrupted by the user")
+
+
 class FeedbackPolicy:
     """The feedback policy of a solution; it owns its buffers, so give each thread its own."""
 

@@ -352,10 +352,10 @@ class Demonstrations(Sequence[Demonstration]):
         positions, stages = steps[:, 0].copy(), steps[:, 1].copy()
         arrays: dict[str, NDArray[Any]] = {}
         entries = self._files.layout.parameters
-        for position in np.unique(positions):
-            place = int(self._places[position])
+        order = np.argsort(positions, kind="stable")
+        for mine in np.split(order, np.flatnonzero(np.diff(positions[order])) + 1):
+            place = int(self._places[positions[mine[0]]])
             tensors, row = self._files.locate(place)
-            mine = positions == position
             for name in names:
                 source = tensors.arrays[name][row]
                 if name != PARAMETERS:
@@ -410,7 +410,7 @@ def load_demonstrations(path: str | os.PathLike[str], *, verify: bool = False) -
     Raises:
         DemonstrationsError: If there is no such folder, it is not complete, or a file is damaged.
     """
-    folder = Path(path)
+    folder = Path(path).absolute()  # files are read on access, wherever the process works by then
     settings, manifest = checked_descriptions(folder, verify)
     try:
         return Demonstrations(folder, settings, manifest)

@@ -25,7 +25,7 @@ from experts.figures.style import (
     encode,
     house_style,
 )
-from experts.maneuver import Maneuver
+from experts.maneuver import FIGURES, Maneuver
 
 _README_SIZE = (8.0, 3.5)  # inches
 _README_DOTS = 200
@@ -48,14 +48,9 @@ def write_figures(
     Returns:
         The files; figures of actuators that the scene does not have are left out.
     """
-    draw: dict[str, Draw] = {
-        "figure-2-snapshots": partial(figure_2, maneuver),
-        "figure-3-pose-error": partial(figure_3, maneuver),
-        "figure-4-error-norms": partial(figure_4, maneuver),
-        "figure-5-base-inputs": partial(figure_5, maneuver),
-        "figure-6-arm-inputs": partial(figure_6, maneuver),
-        **more,
-    }
+    own = (figure_2, figure_3, figure_4, figure_5, figure_6)
+    draw: dict[str, Draw] = {name: partial(each, maneuver) for name, each in zip(FIGURES, own, strict=True)}
+    draw |= more
     files = []
     with house_style():
         for name, make in draw.items():

@@ -7,7 +7,14 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from experts.ddp.box_ddp import BoxDDP
-from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason, uninterrupted
+from experts.ddp.solution import (
+    Callback,
+    IterationRecord,
+    Solution,
+    StopReason,
+    as_interrupted,
+    uninterrupted,
+)
 from experts.guesses.initial_guesses import NEAR_REGULARIZATION, Guess, zero_controls
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem
@@ -82,12 +89,18 @@ class GuessSolver:
         can_be_led = isinstance(self.problem, ArmProblem | WindowProblem) and solution.constraints is None
         wanted = self.reach_target and not guess.interrupted
         if wanted and misses and can_be_led and not is_known(solution, before):
+            attempts.append(Attempt(guess.name, self._led(solution, start, callback)))
+        return attempts
+
+    def _led(self, solution: Solution, start: FloatArray, callback: Callback | None) -> Solution:
+        """Lead a solution to the target; where the user interrupts the compilation for that, it stays."""
+        rows = self.problem.parameters.rows
+        try:
             solver = self._constrained
             solver.initial_regularization = NEAR_REGULARIZATION
-            rows = self.problem.parameters.rows
-            led = solver.solve(start, solution.controls, callback, parameters=rows)
-            attempts.append(Attempt(guess.name, led))
-        return attempts
+            return solver.solve(start, solution.controls, callback, parameters=rows)
+        except KeyboardInterrupt:
+            return as_interrupted(solution)
 
     def solve(self, guess: Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
         """Solve, with the tolerances as constraints if the guess has multipliers of theirs."""

@@ -12,7 +12,6 @@ reaches the target. Kernels with constraints are compiled for the first start th
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any, NoReturn, Self, cast
 
@@ -21,7 +20,14 @@ from numpy.typing import ArrayLike
 
 from dq_space_arm_env.common.real_arrays import real_array
 from experts.ddp.second_order import SecondOrder
-from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason, uninterrupted
+from experts.ddp.solution import (
+    Callback,
+    IterationRecord,
+    Solution,
+    StopReason,
+    as_interrupted,
+    uninterrupted,
+)
 from experts.guesses.attempts import Attempt, GuessSolver
 from experts.guesses.coarsening import checked_factors, find_coarsening
 from experts.guesses.initial_guesses import (
@@ -222,7 +228,8 @@ class GuidedDDP:
             TypeError: If x0 or parameters are masked or not of real numbers.
             ValueError: If x0 or parameters have the wrong shape or are not finite, or an input has no cost of
                 its own.
-            KeyboardInterrupt: If the user interrupts the preparation of the library.
+            KeyboardInterrupt: If the user interrupts the preparation of the library, or what comes before the
+                first solve.
         """
         given = np.array(self.problem.parameters.checked(parameters))  # which may be the problem's own
         _ = self.coarsening  # finding it takes nominal parameters, and so does the preparation of the library
@@ -234,21 +241,24 @@ class GuidedDDP:
         check_state(self.problem, "x0", start)
         attempts: list[Attempt] = []
         long_steps: tuple[dict[str, Any], ...] = ()
-        for guess in self._guesses(start, callback):
-            long_steps += guess.long_steps
-            attempts += self._solver.attempts(guess, start, callback, attempts)
-            last = attempts[-1].solution
-            interrupted = guess.interrupted or last.stop_reason is StopReason.INTERRUPTED
-            if interrupted or (self._solver.is_good(last) and not self.compare):
-                break
-        if self.compare and not interrupted:
-            attempts += self._other_side(attempts, start, callback)
-            interrupted = attempts[-1].solution.stop_reason is StopReason.INTERRUPTED
+        try:
+            for guess in self._guesses(start, callback):
+                long_steps += guess.long_steps
+                attempts += self._solver.attempts(guess, start, callback, attempts)
+                last = attempts[-1].solution
+                ends = guess.interrupted or last.stop_reason is StopReason.INTERRUPTED
+                if ends or (self._solver.is_good(last) and not self.compare):
+                    break
+            if self.compare and not ends:
+                attempts += self._other_side(attempts, start, callback)
+                ends = attempts[-1].solution.stop_reason is StopReason.INTERRUPTED
+        except KeyboardInterrupt:  # on the way from one solve to the next
+            if not attempts:
+                raise
+            ends = True
         solution = self._solver.best(attempts)
-        if interrupted and solution.stop_reason is not StopReason.INTERRUPTED:
-            # An attempt before that one is the cheapest; that it converged does not undo the interrupt.
-            message = "interrupted by the user"
-            solution = replace(solution, stop_reason=StopReason.INTERRUPTED, message=message)
+        if ends:  # that the cheapest attempt converged does not undo the interrupt
+            solution = as_interrupted(solution)
         solution.metadata["long_steps"] = list(long_steps)
         self._remember(solution)
         return solution

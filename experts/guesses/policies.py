@@ -32,6 +32,7 @@ def coarsened(solution: Solution, problem: ArmProblem) -> Solution:
     problem.keep_previous(states, controls)
     return replace(
         solution,
+        problem=problem,
         states=states,
         controls=controls,
         feedback_gains=solution.feedback_gains[::factor],
@@ -70,6 +71,7 @@ def refined(solution: Solution, problem: ShootingProblem) -> Solution:
         problem.keep_previous(states, controls)
     return replace(
         solution,
+        problem=problem,
         states=states,
         controls=controls,
         feedback_gains=np.repeat(solution.feedback_gains, factor, axis=0),

@@ -36,7 +36,8 @@ class Preparation(NamedTuple):
 
 def preparation_key(problem: ArmProblem, settings: Mapping[str, Any]) -> str:
     """Hash all that a preparation follows from."""
-    numbers = (problem.initial_state, problem.parameters.nominal, problem.control_upper)
+    with problem.parameters.being(None):  # as it is prepared
+        numbers = (problem.initial_state, problem.parameters.nominal, problem.control_upper)
     facts = [
         problem.scene.content_hash(),
         problem.integrator,

@@ -84,6 +84,11 @@ def prepare(loop: Callable[..., Any], *arguments: Any) -> None:
     cast(Any, loop).compile(tuple(map(typeof, arguments)))
 
 
+def has_code(loop: Callable[..., Any]) -> bool:
+    """Tell whether a loop is compiled in this process, for arguments of any types."""
+    return bool(cast(Any, loop).overloads)
+
+
 def is_prepared(loop: Callable[..., Any], *arguments: Any) -> bool:
     """Tell whether a loop is compiled for arguments of some types, here or in the cache."""
     dispatcher, signature = cast(Any, loop), tuple(map(typeof, arguments))

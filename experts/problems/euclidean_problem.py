@@ -100,7 +100,7 @@ class EuclideanProblem(ABC):
         self.parameters = StageParameters(horizon, nominal)
         self.terminal_inputs: tuple[FloatArray, ...] = tuple(rows[-1:] for rows in self.parameters.inputs)
         lower, upper = (
-            np.full(n_controls, default) if bound is None else real_array(name, bound, np.float64)
+            np.full(n_controls, default) if bound is None else np.array(real_array(name, bound, np.float64))
             for name, bound, default in zip(
                 ("control_lower", "control_upper"), bounds, (-np.inf, np.inf), strict=True
             )

@@ -55,7 +55,11 @@ class WindowProblem:
 
     def constrained(self, reserve: float = 0.0) -> "WindowProblem":
         """See `ArmProblem.constrained`; for the last stages of a maneuver."""
-        return WindowProblem(self.maneuver.constrained(reserve), self.horizon)
+        maneuver = self.maneuver.constrained(reserve)
+        maneuver.parameters.rows[:] = self.maneuver.parameters.rows
+        found = WindowProblem(maneuver, self.horizon)
+        found.begin_at(self._first)
+        return found
 
     def begin_at(self, stage: int) -> None:
         """Take the parameters of the maneuver's stages from a stage on."""

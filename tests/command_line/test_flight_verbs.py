@@ -84,7 +84,7 @@ def test_solve_prints_table_or_json(
 def test_figures_of_an_earlier_run_do_not_stay_beside_another_solution(
     scene_file: str, tmp_path: Path
 ) -> None:
-    mine, old = tmp_path / "figure-1-mine.png", tmp_path / "figure-3-pose-error.png"
+    mine, old = tmp_path / "figure-3-of-my-thesis.png", tmp_path / "figure-3-pose-error.png"
     for file in (mine, old):
         file.write_bytes(b"")
     assert main(["solve", scene_file, "--solver", "box", "--out", str(tmp_path)]) == SUCCESS

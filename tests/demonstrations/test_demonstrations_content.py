@@ -119,6 +119,7 @@ def test_single_precision_is_taken_in_double(quick_scene: Scene, tmp_path: Path)
     ("changes", "sentence"),
     [
         ({"n": 0}, "n: 0, should be at least 1"),
+        ({"workers": True}, "workers: True, should be a whole number of at least 1"),
         ({"n": True}, "n: True, should be a whole number of at least 1"),
         ({"n": 2.0}, "n: 2.0, should be a whole number of at least 1"),
         ({"seed": -1}, "seed: -1, should be at least 0"),

@@ -85,6 +85,13 @@ def test_copies_and_pickles_open_the_files_anew(whole: Demonstrations):
         assert twin.scene == some.scene
 
 
+def test_a_relative_path_is_that_of_the_moment(whole: Demonstrations, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(whole.path.parent)
+    relative = load_demonstrations(whole.path.name)
+    monkeypatch.chdir("/")
+    np.testing.assert_array_equal(relative[9].actions, whole[9].actions)
+
+
 def test_a_split_shares_no_problem(whole: Demonstrations):
     train, test, rest = whole.split(0.5, 0.25, 0.25, seed=1)
     assert (len(train), len(test), len(rest)) == (9, 5, 4)

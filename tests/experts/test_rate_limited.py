@@ -6,6 +6,7 @@ import pytest
 from dq_space_arm_env import DQSpaceArmEnv, load_scene
 from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
 from experts.problems.arm_problem import ArmProblem
+from experts.problems.window_problem import WindowProblem
 from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
 
 PLAIN = load_scene("planar").replace(simulation={"steps": 200, "dt": 0.075})
@@ -164,3 +165,17 @@ def test_the_receding_horizon_comes_down_in_time_for_what_is_beyond_its_window()
         asked.append(expert.control[0])
     assert min(asked) < -0.75
     assert charge <= 1e-12
+
+
+def test_a_window_with_tolerances_as_constraints_has_the_same_limits():
+    """What is switched off before the window does not limit it."""
+    scene = closed_in_time({}, [{"kind": "control_rate", "name": "rate", "base_torque": 2.0}])
+    turning, coasting = (phase.model_dump() for phase in scene.phases)
+    again = {**turning, "name": "turning again", "steps": 8}
+    scene = scene.replace(phases=[{**turning, "steps": 8}, {**coasting, "steps": 8}, again])
+    window = WindowProblem(ArmProblem(scene), 8)
+    window.begin_at(16)
+    constrained = window.constrained(0.05)
+    constrained.parameters.set(window.parameters.rows)
+    np.testing.assert_array_equal(window.control_upper, np.ones((8, 1)))
+    np.testing.assert_array_equal(constrained.control_upper, window.control_upper)

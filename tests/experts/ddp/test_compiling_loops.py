@@ -36,3 +36,10 @@ def exercise(scene: Scene) -> None:
     work.cost_rounding()
     work.try_step(1.0)
     work.try_steps(shooting.SHORTER_STEPS)
+
+
+def test_a_second_workspace_does_not_ask_for_its_loops(monkeypatch: pytest.MonkeyPatch):
+    shooting.compile_other_loops()
+    monkeypatch.setattr(shooting, "is_prepared", None)
+    monkeypatch.setattr(shooting, "prepare", None)
+    shooting.compile_other_loops()

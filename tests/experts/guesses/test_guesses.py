@@ -231,6 +231,21 @@ def test_after_an_interrupt_no_other_guess_is_tried(unicycle):
     assert names(solution) == ["policy 0"]
 
 
+def test_an_interrupt_between_two_solves_leaves_what_the_first_found(unicycle, monkeypatch):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    solver = GuidedDDP(unicycle, compare=True)
+    expected = solver.solve(ELSEWHERE)
+    monkeypatch.setattr(GuidedDDP, "_other_side", interrupt)
+    found = solver.solve(ELSEWHERE)
+    assert found.stop_reason is StopReason.INTERRUPTED
+    np.testing.assert_array_equal(found.controls, expected.controls)
+    monkeypatch.setattr("experts.guesses.guided.ranked_guesses", interrupt)
+    with pytest.raises(KeyboardInterrupt):  # there is nothing yet
+        solver.solve(ELSEWHERE)
+
+
 def test_an_interrupt_leaves_no_half_made_library(unicycle, monkeypatch):
     def interrupt(*arguments):
         raise KeyboardInterrupt

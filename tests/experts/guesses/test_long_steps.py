@@ -353,6 +353,20 @@ def test_other_settings_have_another_preparation(kept):
     assert len(kept()) == 4
 
 
+def test_the_same_preparation_serves_all_parameters():
+    problem = ArmProblem(load_scene("planar").replace(parameters=["actuators.joint_torque"]))
+    key = preparation_key(problem, {})
+    problem.parameters.set(0.9 * problem.parameters.nominal)
+    assert preparation_key(problem, {}) == key
+
+
+def test_the_library_is_in_the_steps_of_the_problem(paper):
+    (maneuver,) = paper.library
+    assert maneuver.problem is paper.problem
+    last = paper.problem.horizon - 1
+    np.testing.assert_allclose(maneuver.policy()(maneuver.states[last], last), maneuver.controls[last])
+
+
 def test_success_as_constraint_has_another_preparation():
     problem = ArmProblem("planar")
     keys = [preparation_key(each, {}) for each in (problem, problem.constrained(), problem.constrained(0.3))]

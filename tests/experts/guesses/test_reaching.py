@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import load_scene
-from experts import BoxDDP, GuidedDDP
+from experts import BoxDDP, GuidedDDP, StopReason
 from experts.ddp.augmented_lagrangian import PATIENCE, AugmentedLagrangian
 from experts.ddp.end_response import EndResponse, end_response
+from experts.guesses.attempts import GuessSolver
 from experts.problems.arm_problem import ArmProblem
 from scripts.benchmarks.solvers.runs import roll_out
 
@@ -182,3 +183,16 @@ def test_a_reserve_is_a_share_of_the_tolerances(paper, start):
     assert paper.problem.misses(solution.states[-1]) == pytest.approx(0.89, abs=0.01)
     with pytest.raises(ValueError, match=r"reserve is 0\.5; it must be less than 0\.5"):
         GuidedDDP("paper", reserve=0.5)
+
+
+def test_an_interrupt_while_constraints_are_compiled_leaves_the_maneuver_that_misses(
+    paper, start, cheapest, monkeypatch
+):
+    def compiling(solver):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(GuessSolver, "_constrained", property(compiling))
+    found = GuidedDDP("paper", library=paper.library).solve(start)
+    assert found.stop_reason is StopReason.INTERRUPTED
+    assert found.message.startswith("interrupted by the user")
+    assert found.cost == pytest.approx(cheapest.cost, rel=1e-3)  # in long steps, flown in the problem's

@@ -1,6 +1,7 @@
 """Users' problems in NumPy: the same as in CasADi, differences, and exceptions that come through."""
 
 import gc
+import math
 import os
 import signal
 import threading
@@ -275,3 +276,33 @@ def test_numbers_that_are_not_finite_end_the_solve_and_the_function_is_named(cha
 def test_contradictions_are_refused(changes, error, sentence):
     with pytest.raises(error, match=sentence):
         pendulum(**changes)
+
+
+def test_bounds_are_copies():
+    upper = np.array([5.0])
+    problem = pendulum(control_upper=upper)
+    upper[0] = -7.0
+    assert problem.control_upper == 5.0
+
+
+def test_steps_that_diverge_are_not_gone_on_with():
+    """Functions of the math module raise where those of NumPy return NaN."""
+
+    def problem(sin):
+        def step(x, u):
+            assert np.isfinite(x).all()
+            return [x[0] + 0.1 * (np.exp(u[0]) - 1.0 + 0.1 * sin(x[0]) + x[0] ** 3)]
+
+        return PythonProblem(
+            step,
+            lambda x, u: 1e-4 * u[0] ** 2 + (x[0] - 2.0) ** 2,
+            lambda x: (x[0] - 2.0) ** 2,
+            initial_state=[0.0],
+            n_controls=1,
+            horizon=20,
+        )
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        solutions = [BoxDDP(problem(sin)).solve() for sin in (np.sin, math.sin)]
+    assert solutions[0].converged
+    assert solutions[1].cost == solutions[0].cost
