@@ -62,7 +62,7 @@ class Disturbances:
         count: int = 1,
     ) -> None:
         layout, steps = StateLayout.of(scene), scene.simulation.steps
-        self._rng, self._step = rng, 0
+        self._rng, self._step, self._steps = rng, 0, steps
         self._n_t, self._n_u, self._velocity = layout.n_t, layout.n_u, layout.tangent.base_velocity
         if not 0.0 <= pushes < np.inf:
             raise ValueError(f"pushes: {pushes}, should be a finite number of at least 0")
@@ -100,7 +100,7 @@ class Disturbances:
             measurement = self._measurement * self._rng.standard_normal((self.count, self._n_t))
         if self._inputs is not None:
             inputs = self._inputs * self._rng.standard_normal((self.count, self._n_u))
-        self._step += 1
+        self._step = (self._step + 1) % self._steps  # the next episode has its own pushes
         return Disturbance(push, measurement, inputs)
 
     def _draw_push(self) -> FloatArray | None:

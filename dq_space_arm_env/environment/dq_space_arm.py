@@ -117,7 +117,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     q_{X/Y} is the pose of X with respect to Y, * conjugates; I is the inertial frame, G the tip, D the target. q_{D/G} and -q_{D/G} are the same pose:
     the sign is chosen at reset such that the scalar part is not negative, and carried along by continuity, as in the cost. The observation determines the
-    state; in a planar scene the error has only the four entries that are not identically zero.
+    state, but for whether a catch was met, which `info["caught"]` tells; in a planar scene the error has only the four entries that are not identically zero.
 
     Where the target moves, two twists stand before the time left, in tip axes, with the wrist held (in a planar scene three entries each; bounds are 1e12):
 
@@ -505,8 +505,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             self.set_state(saved)
             super().reset(seed=seed)
         else:
+            start = given_start(self.kernels, given)  # if it is refused, nothing has changed
             super().reset(seed=seed)
-            self._begin(given_start(self.kernels, given))
+            self._begin(start)
         memory = self._memory.copy()
         self._observe.on_rows(_ROW)
         if saved is not None:  # its costs are those of the step before, which may be rounded otherwise

@@ -20,7 +20,7 @@ from dq_space_arm_env.environment.goal_rewards import (
     RewardType,
     show_goals,
 )
-from dq_space_arm_env.environment.reset_options import checked_options, saved_state
+from dq_space_arm_env.environment.reset_options import checked_options, given_start, saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
 from dq_space_arm_env.environment.specification import PlainSpec, goal_observation_space
 from dq_space_arm_env.scene import Scene
@@ -244,8 +244,10 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
         Raises:
             ValueError: If an option is wrong.
         """
-        saved = saved_state(checked_options(options))
+        given = checked_options(options)
+        saved = saved_state(given)
         if saved is None:
+            given_start(self.kernels, given)  # if it is refused, nothing has changed
             self._truncated = False
         else:
             self.set_state(saved)

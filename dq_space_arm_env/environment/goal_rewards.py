@@ -60,7 +60,8 @@ class GoalRewards:
             raise ValueError(f"reward_type: {reward_type!r} is unknown; choose from {kinds}")
         _check_scene(kernels.scene)
         self._kernels, self._dense = kernels, reward_type == "dense"
-        self._compare_rows = KernelCall(kernels.kernel("environment_goal"), {})
+        self._kernel = kernels.kernel("environment_goal")
+        self._idle: list[KernelCall] = []  # threads never share one
 
     def compare(self, achieved: ArrayLike, desired: ArrayLike) -> Comparison:
         """Compare goals, shape (8,) or (B, 8)."""
@@ -72,10 +73,13 @@ class GoalRewards:
         batch = pairs[0].shape[:-1]
         rows = [np.ascontiguousarray(goal).reshape(-1, 8) for goal in pairs]
         errors, cost, success = np.empty((*batch, 2)), np.empty(batch), np.empty(batch, dtype=np.bool_)
-        self._compare_rows.place(
-            achieved=rows[0], desired=rows[1], errors=errors, cost=cost, is_success=success
-        )
-        self._compare_rows(len(rows[0]), self._kernels.threads)
+        try:  # `pop` and `append` are atomic
+            call = self._idle.pop()
+        except IndexError:
+            call = KernelCall(self._kernel, {})
+        call.place(achieved=rows[0], desired=rows[1], errors=errors, cost=cost, is_success=success)
+        call(len(rows[0]), self._kernels.threads)
+        self._idle.append(call)
         return Comparison(errors[..., 0], errors[..., 1], cost, success)
 
     def of(self, comparison: Comparison, diverged: bool | NDArray[np.bool_]) -> Array:

@@ -126,7 +126,7 @@ def _check_actuators(kernels: Kernels, x: Array, parameters: Array | None) -> No
     if parameters is not None:
         most = np.maximum(most, layout.limits_with(parameters))
     least = layout.lower_limits(most)
-    kept = [*layout.previous_controls, *(chain.control for chain in layout.chains for _ in chain.names)]
+    kept = _kept_controls(layout)
     where = [*entries[layout.state.actuators], *entries[layout.state.drives]]
     bounds = [*zip(where, least[kept], most[kept], strict=True)]
     bounds += [(index, 0.0, math.inf) for index in entries[layout.state.propellant]]
@@ -171,7 +171,21 @@ def check_scene(scene: Scene) -> None:
             f"{start + width:.3g}, should be at most {STATE_LIMIT:g}, beyond which a simulation counts as "
             "diverged"
         )
+    kept = _kept_controls(layout)
+    most = math.hypot(*layout.control_limit[kept].tolist())
+    if math.hypot(start, most) > STATE_LIMIT:
+        largest = kept[int(layout.control_limit[kept].argmax())]
+        raise ValueError(
+            f"scene {scene.name!r}: {layout.control.limits[largest]} = {layout.control_limit[largest]:g}: "
+            f"what lags, is late or limited in its rate is in the state, here up to {most:.3g}; the norm of "
+            f"a state should be at most {STATE_LIMIT:g}, beyond which a simulation counts as diverged"
+        )
     _check_lengths(scene)
+
+
+def _kept_controls(layout: StateLayout) -> list[int]:
+    """The controls of the entries `actuators`, then `drives`, of the state."""
+    return [*layout.previous_controls, *(chain.control for chain in layout.chains for _ in chain.names)]
 
 
 def _check_lengths(scene: Scene) -> None:

@@ -25,6 +25,7 @@ from dq_space_arm_env.compiler import native
 from dq_space_arm_env.kernels.bound import BoundKernel, SingleRowCalls, rows_of
 from dq_space_arm_env.scene.entries import ParameterEntries
 from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.phases import StagedNumbers
 from dq_space_arm_env.scene.schema import Scene
 
 if TYPE_CHECKING:
@@ -49,6 +50,18 @@ class KernelLibrary:
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
         self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
         self._single_row_calls: dict[tuple[str, str | None, bool, bool], SingleRowCalls] = {}
+
+    @cached_property
+    def staged(self) -> StagedNumbers:
+        """What the scene's phases change: a search among scenes would hash this one, and steps need it."""
+        return self.scene.staged
+
+    @cached_property
+    def values_of_phases(self) -> tuple[list[int], NDArray[Any]]:
+        """Indices of the parameters that phases change, and their values, a row for each phase."""
+        names = self.layout.parameters.names
+        values = np.array([*self.staged.values.values()], self.dtype).T
+        return [names.index(name) for name in self.staged.values], values
 
     @cached_property
     def _programs(self) -> ScenePrograms:

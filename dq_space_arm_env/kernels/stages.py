@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.kernels.bound import walk
 from dq_space_arm_env.scene.motion import Waypoints
-from dq_space_arm_env.scene.parameters import CATCH, is_part, target_entries, velocity_entries
+from dq_space_arm_env.scene.parameters import CATCH, target_entries, velocity_entries
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.task.step_report import MEMORY
 
@@ -26,12 +26,11 @@ def fill_stages(kernels: KernelLibrary, rows: NDArray[Any]) -> None:
         rows[:, moving] = target_path(kernels, rows[0, moving])
     if not scene.phases:
         return
-    starts, values, resting, catches = scene.staged
+    starts, _, resting, catches = kernels.staged
     ends = (*starts[1:], len(rows))
     velocity = layout.target_velocity_with(rows)
-    for name, each in values.items():
-        for begin, end, value in zip(starts, ends, each, strict=True):
-            rows[begin:end, entries.names.index(name)] = value
+    changed, values = kernels.values_of_phases
+    rows[:, changed] = values[np.searchsorted(starts, np.arange(len(rows)), side="right") - 1]
     before = (None, *resting[:-1])
     for begin, end, pose, rested, caught in zip(starts, ends, resting, before, catches, strict=True):
         if caught:  # from where the target is in the phase before
@@ -56,21 +55,19 @@ def present_parameters(
         Those with the target as it is now, and what is held; shape (k, n_p).
     """
     entries, found = kernels.parameters, parameters.copy()
-    size, names = len(entries.moving), entries.names
+    size = len(entries.moving)
     if entries.staged:
-        starts, values, _, catches = kernels.scene.staged
+        starts, _, _, catches = kernels.staged
         stages = memory[:, 0].astype(np.int64)
         caught = [start for start, catch in zip(starts, catches, strict=True) if catch]
         for row in np.flatnonzero(np.isin(stages + 1, caught)):  # with the twist of the target then
             path = np.tile(found[row], (kernels.scene.simulation.steps + 1, 1))
             fill_stages(kernels, path)
             found[row] = path[stages[row]]
-        phases = np.searchsorted(starts, stages, side="right") - 1
-        for name, each in values.items():
-            found[:, names.index(name)] = np.array(each)[phases]
+        changed, values = kernels.values_of_phases
+        found[:, changed] = values[np.searchsorted(starts, stages, side="right") - 1]
         if caught:  # or missed, and not held since
-            payload = [index for index, name in enumerate(names) if is_part(name, "payload")]
-            found[:, payload] *= memory[:, len(MEMORY) + size][:, None]
+            found[:, entries.indices("payload")] *= memory[:, len(MEMORY) + size][:, None]
     found[:, list(entries.moving)] = memory[:, len(MEMORY) : len(MEMORY) + size]
     return found
 

@@ -87,6 +87,8 @@ def _joint_limit_problems(
     if not any(math.isfinite(bound) for link, *own in bounds if link.freedoms == 1 for bound in own):
         sentence = "must bound something: all its bounds are infinite, or no joint has one coordinate"
         yield Problem(here, limits, sentence)
+    if not count:
+        return
     written = max(len(getattr(limits, field)) for field in ("lower", "upper", "rate"))
     for index in range(written):  # one number for all links is one mistake
         if not lower[index] < upper[index]:

@@ -5,6 +5,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -172,7 +173,14 @@ class ParameterEntries(_Entries):
         Returns:
             Their indices; empty if there are none.
         """
-        return [index for index, name in enumerate(self.names) if is_part(name, path)]
+        if path not in self._found:
+            self._found[path] = [index for index, name in enumerate(self.names) if is_part(name, path)]
+        return [*self._found[path]]
+
+    @cached_property
+    def _found(self) -> dict[str, list[int]]:
+        """Indices found before: environments look for them in every step."""
+        return {}
 
     @classmethod
     def of(cls, scene: Scene) -> Self:

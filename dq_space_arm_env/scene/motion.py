@@ -107,13 +107,14 @@ def _read_file(value: dict[str, Any]) -> Waypoints:
     if others or not isinstance(path, str | Path):
         raise problem("must have a kind, file, and a path, that of a file of poses; nothing else")
     try:
-        rows = list(csv.reader(StringIO(read_text(Path(path)))))
+        text = read_text(Path(path)).removeprefix("\ufeff")  # which Excel writes first
+        rows = [*enumerate(csv.reader(StringIO(text)), start=1)]
     except (OSError, UnreadableError, csv.Error) as error:
         raise problem(f"cannot be read: {error}") from error
-    if not rows or tuple(name.strip() for name in rows[0]) != FILE_COLUMNS:
+    if not rows or tuple(name.strip() for name in rows[0][1]) != FILE_COLUMNS:
         raise problem(f"the first line of {path} must be {','.join(FILE_COLUMNS)}")
-    points = []
-    for number, row in enumerate(rows[1:], start=2):
+    rows, points = [(number, row) for number, row in rows[1:] if row], []  # empty lines say nothing
+    for number, row in rows:
         try:
             time, *pose = (float(entry) for entry in row)
         except ValueError:
@@ -129,7 +130,7 @@ def _read_file(value: dict[str, Any]) -> Waypoints:
             raise
         index = int(detail["loc"][1])
         what = detail["msg"].removeprefix(f"points[{index}].")
-        raise problem(f"line {index + 2} of {path}: {what}") from None
+        raise problem(f"line {rows[index][0]} of {path}: {what}") from None
 
 
 Motion = Annotated[ScrewMotion | Tumbling | Waypoints, BeforeValidator(_read_motion)]

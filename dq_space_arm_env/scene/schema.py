@@ -34,6 +34,8 @@ from dq_space_arm_env.scene.maneuver import (
 from dq_space_arm_env.scene.motion import Motion, ScrewMotion, Tumbling, Waypoints
 from dq_space_arm_env.scene.parameters import (
     ACTUATORS,
+    CATCH,
+    PHASE,
     control_numbers,
     drawn_factors,
     is_part,
@@ -316,21 +318,28 @@ class Scene(Model):
     def _cost_problems(self) -> Iterator[Problem]:
         """Find weights with which the reward of inputs at their limits would not be a number."""
         for name, controls in control_numbers(self).items():
-            limits = [each.limit.nominal for each in controls if each.limit.nominal < math.inf]
-            bound, weight = max(limits, default=0.0), getattr(self.cost, name)
-            heaviest = max((each.weight.nominal for each in controls), default=0.0)
-            cost = heaviest * bound**2 * self.simulation.steps
+            limited = [each for each in controls if each.limit.nominal < math.inf]
+            costs = [each.weight.nominal * each.limit.nominal**2 for each in limited]
+            cost = max(costs, default=0.0) * self.simulation.steps
             if cost > _LARGEST_COST:
+                worst = limited[costs.index(max(costs))]
+                here: _Location = ("cost", name)
+                weight, limit = getattr(self.cost, name), f"actuators.{ACTUATORS[name]}"
+                if is_part(worst.weight.name, "links"):
+                    index = int(worst.weight.name.split(".")[1])
+                    here, weight = ("links", index, "torque_weight"), worst.weight.nominal
+                if is_part(worst.limit.name, "links"):
+                    limit = worst.limit.name
                 sentence = (
-                    f"with the limit {bound:g} and {self.simulation.steps} steps an episode may cost "
-                    f"{cost:.3g}, it must be at most {_LARGEST_COST:g}: lower it or "
-                    f"actuators.{ACTUATORS[name]}"
+                    f"with the limit {worst.limit.nominal:g} and {self.simulation.steps} steps an episode "
+                    f"may cost {cost:.3g}, it must be at most {_LARGEST_COST:g}: lower it or {limit}"
                 )
-                yield Problem(("cost", name), weight, sentence)
+                yield Problem(here, weight, sentence)
 
     def _parameter_problems(self) -> Iterator[Problem]:
         """Find paths that lead to no number that may vary."""
         names = [number.name for number in numbers(self)] if self.parameters else []
+        names = [name for name in names if not is_part(name, PHASE) and not is_part(name, CATCH)]
         for index, path in enumerate(self.parameters):
             if not any(is_part(name, path) for name in names):
                 paths = dict.fromkeys(part for name in names for part in parents(name))

@@ -83,7 +83,8 @@ class WorstCase:
         torques = [norm(inputs.torque), *map(casadi.fabs, inputs.wheel_torques)]
         pairs = [*zip(sizes, self.tree.jets, strict=True)]
         torques += [casadi.fabs(size) * math.hypot(*jet.torque) for size, jet in pairs]
-        if fixed := norm(self.tree.base.center_of_mass):  # of what is fixed to the base
+        fixed = norm(self.tree.base.center_of_mass)  # of what is fixed to the base
+        if isinstance(fixed, casadi.SX) or fixed:
             torques.append(fixed * total([norm(inputs.force), *map(casadi.fabs, sizes)]))
         return total([norm(inputs.force), *map(casadi.fabs, sizes)]), total(torques)
 

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import threading
 import warnings
 
 import gymnasium
@@ -344,3 +345,46 @@ def test_an_episode_that_has_just_begun_is_not_truncated():
     assert env.unwrapped.compute_truncated(*goals, info)
     observation, info = env.reset()
     assert not env.unwrapped.compute_truncated(*goals, info)
+
+
+def test_rewards_are_computed_while_another_thread_steps():
+    env = make(DRAWN)
+    observation, _ = env.reset(seed=0)
+    goals = (np.tile(observation[name], (4096, 1)) for name in ("achieved_goal", "desired_goal"))
+    achieved, desired = goals
+    expected, wrong, ended = env.compute_reward(achieved, desired), [], threading.Event()
+
+    def relabel():
+        while not ended.is_set():
+            wrong.append(not np.array_equal(env.compute_reward(achieved, desired), expected))
+
+    learner = threading.Thread(target=relabel)
+    learner.start()
+    while len(wrong) < 200 and learner.is_alive():
+        if env.step(np.zeros(env.action_space.shape, np.float32))[3]:
+            env.reset()
+    ended.set()
+    learner.join()
+    assert not any(wrong)
+
+
+def test_a_refused_reset_changes_nothing():
+    env = make(DRAWN)
+    env.reset(seed=0)
+    while not env.step(np.zeros(env.action_space.shape, np.float32))[3]:
+        pass
+    before = env.get_state()
+    with pytest.raises(ValueError, match="bogus"):
+        env.reset(seed=9, options={"bogus": 1})
+    assert data_equivalence(env.get_state(), before)
+    assert env.compute_truncated(None, None)
+
+
+def test_steps_look_for_no_names(monkeypatch):
+    env = make(short("capture-and-detumble"))
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float32)
+    env.step(action)
+    monkeypatch.setattr("dq_space_arm_env.scene.entries.is_part", None)
+    monkeypatch.setattr("dq_space_arm_env.scene.schema.staged_numbers", None)
+    env.step(action)

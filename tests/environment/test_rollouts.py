@@ -245,3 +245,10 @@ def test_equal_generators_draw_equal_disturbances(scene):
     for _ in range(3):
         for mine, theirs in zip(one.draw()[:2], other.draw()[:2], strict=True):
             np.testing.assert_array_equal(mine, theirs)
+
+
+def test_every_episode_has_its_pushes_at_even_intervals():
+    scene = short("planar", 50)
+    disturbances = Disturbances(scene, np.random.default_rng(0), push=0.1, pushes=2, evenly=True)
+    struck = [disturbances.draw().push is not None for _ in range(3 * 50)]
+    assert np.array(struck).reshape(3, 50).sum(axis=1).tolist() == [2, 2, 2]

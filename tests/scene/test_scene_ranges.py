@@ -67,6 +67,18 @@ def test_a_cost_that_overflows_is_refused(data: dict[str, Any], change: Change, 
     (sentence,) = refusals(change(data, "cost.base_force", 1e10))
     assert sentence.startswith("cost.base_force = ")
     assert "an episode may cost 1e+33" in sentence
+    assert sentence.endswith("lower it or actuators.base_force")
+
+
+def test_the_weight_of_a_motor_is_named_where_it_is_too_large(
+    data: dict[str, Any], change: Change, refusals: Refusals
+) -> None:
+    """Another joint has the largest limit."""
+    change(data, "links.1.torque_limit", 1e6)
+    change(data, "links.0.torque_limit", 1e4)
+    (sentence,) = refusals(change(data, "links.0.torque_weight", 1e24))
+    assert sentence.startswith("links[0].torque_weight = 1e+24: with the limit 10000 ")
+    assert sentence.endswith("lower it or links.0.torque_limit")
 
 
 @pytest.mark.parametrize(
@@ -76,6 +88,10 @@ def test_a_cost_that_overflows_is_refused(data: dict[str, Any], change: Change, 
         ({"spread": {"joint_rates": 1e6}}, r"spread\.joint_rates = 1e\+06"),
         ({"target": {"pose": {"position": [1e8, 0, 0]}}}, r"target\.pose\.position: 1e\+08 m"),
         ({"tip": {"position": [1e8, 0, 0]}}, r"tip\.position: 1e\+08 m"),
+        (
+            {"actuators": {"base_force": {"limit": 1e6, "time_constant": 0.05}}},
+            r"actuators\.base_force\.limit\.x = 1e\+06: what lags, is late or limited in its rate",
+        ),
     ],
 )
 def test_an_environment_refuses_what_it_cannot_observe(changes: dict[str, Any], said: str) -> None:

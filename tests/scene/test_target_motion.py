@@ -76,6 +76,19 @@ def test_a_bad_file_of_poses_is_refused(lines: list[str] | None, what: str, tmp_
         with_motion({"kind": "file", "path": str(path)})
 
 
+def test_a_file_of_a_spreadsheet_is_read(tmp_path: Path) -> None:
+    """With the mark of its encoding, and empty lines."""
+    path = tmp_path / "poses.csv"
+    path.write_text("\ufeff" + "\r\n".join([HEADER, ROWS[0], "", *ROWS[1:], "", ""]), "utf-8")
+    plain = tmp_path / "plain.csv"
+    plain.write_text("\n".join([HEADER, *ROWS]))
+    read, expected = (with_motion({"kind": "file", "path": each}) for each in (path, plain))
+    assert read.target.motion == expected.target.motion
+    path.write_text("\n".join([HEADER, "", ROWS[1], ROWS[0]]))
+    with pytest.raises(SceneError, match=r"line 4 of .*poses.csv: time = 0.*: must be later"):
+        with_motion({"kind": "file", "path": path})
+
+
 def test_a_file_needs_a_path_and_nothing_else() -> None:
     for motion in (
         {"kind": "file"},

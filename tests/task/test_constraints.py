@@ -362,3 +362,10 @@ def test_two_constraints_of_a_name_are_refused():
     entry = {"kind": "momentum", "name": "it", "linear": 1.0}
     with pytest.raises(SceneError, match="another constraint has this name"):
         load_scene("paper").replace(constraints=[entry, entry])
+
+
+def test_joint_limits_of_no_joints_are_refused() -> None:
+    limits = {"kind": "joint_limits", "name": "limits", "upper": 1.0}
+    scene = {"name": "body", "target": {"pose": {}}, "constraints": [limits]}
+    with pytest.raises(SceneError, match=r"constraints\[0\].*must bound something"):
+        load_scene({**scene, "base": {"mass": 10.0, "inertia": [1.0, 1.0, 1.0]}})

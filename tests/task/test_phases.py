@@ -662,3 +662,9 @@ def test_a_catch_moves_what_is_left_in_the_tank_too():
     after = catch_payload(*kernels, x, np.zeros(6))
     free, held = (SceneEquations.of(scene, []) for scene in scenes)
     np.testing.assert_allclose(momentum(held, after.tolist()), momentum(free, x.tolist()), atol=1e-11)
+
+
+@pytest.mark.parametrize("path", ["phase", "catch", "catch.now"])
+def test_what_the_stage_says_is_no_parameter(path: str) -> None:
+    with pytest.raises(SceneError, match=rf"parameters\[0\] = '{path}': leads to no number that may vary"):
+        load_scene("capture-and-detumble").replace(parameters=[path])

@@ -186,3 +186,26 @@ def check_that_ending_early_costs_more(scene, velocity, toward_the_obstacle):
     assert (steps, few < steps) == (scene.simulation.steps, True)
     assert ended < flown
     return info
+
+
+@pytest.mark.parametrize("spread", [{"base_mass": 0.1}, {"link_masses": 0.1}])
+def test_masses_vary_beside_a_link_that_is_fixed_to_the_base(spread):
+    panel = {"name": "panel", "mass": 5.0, "inertia": [0.3, 0.4, 0.7], "center_of_mass": [0.0, 0.8, 0.0]}
+    scene = load_scene(
+        {
+            "name": "panel",
+            "base": {"mass": 100.0, "inertia": [10.0, 10.0, 9.0]},
+            "links": [{**panel, "joint": {"position": [0.0, 0.5, 0.0]}, "joint_type": "fixed"}],
+            "tip_link": "base",
+            "actuators": {"base_force": {"limit": 10.0}, "base_torque": {"limit": 2.0}},
+            "target": {"pose": {"position": [1.0, 0.0, 2.0]}},
+            "spread": spread,
+        }
+    )
+    p = casadi.SX.sym("p", len(compile_scene(scene).layout.parameters.names))
+    equations = SceneEquations.of(scene, casadi.vertsplit(p))
+    x = casadi.SX.sym("x", equations.field.n_x)
+    bound = casadi.Function("bound", [x, p], [worst_cost(equations, [equations], casadi.vertsplit(x), STEPS)])
+    layout = compile_scene(scene).layout
+    expected = charge(scene.replace(spread={}), [layout.initial_state], STEPS)
+    assert float(bound(layout.initial_state, layout.parameters.nominal)) == pytest.approx(expected[0])
