@@ -115,7 +115,7 @@ class ProcessExecutor:
                     if losses < MOST_LOSSES:
                         _employ(selector, task, losses + 1)
                         continue
-                    result = task.lost(
+                    yield task.lost(
                         f"{losses + 1} processes in a row ended without finishing {task.label}, perhaps out "
                         f"of memory: use fewer than {self.workers} workers"
                     )
@@ -123,13 +123,13 @@ class ProcessExecutor:
                     if following is not None:
                         _employ(selector, following)
                 else:
-                    following = next(remaining, None)
+                    yield result
+                    following = next(remaining, None)  # which may depend on that result
                     if following is None:
                         _dismiss(selector, worker)
                     else:
                         _assign(worker, following)
                         selector.modify(worker, selectors.EVENT_READ, (following, 0))
-                yield result
 
 
 def _employ(selector: selectors.BaseSelector, task: Task[Any], losses: int = 0) -> None:

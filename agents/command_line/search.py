@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 @click.option(
     "--pruning/--no-pruning",
     default=True,
-    help="Stop trials whose learning curve falls below the median of the others.",
+    help="Stop trials whose best point so far is below the median of the others.",
 )
 @click.option("--workers", type=int, help="Trials side by side.  [default: one per processor]")
 @ray_option
@@ -111,12 +111,12 @@ def search(
 
 
 def _table(rows: Sequence[Row], space: SearchSpace) -> TextTable:
-    from agents.experiments.many_trainings import COST, OUTCOME, SECONDS, SUCCESS
+    from agents.experiments.many_trainings import COST, OUTCOME, SECONDS, SUCCESS, VIOLATING, known
     from dq_space_arm_env.common.tables import Column, tabulate
 
     keys = [Column(key, key.replace(".", ".\n"), ".4g") for key in space.search]
     title = "Trials, flown from validation starts; cost: median"
-    return tabulate(title, rows, ["trial", *keys, SUCCESS, COST, SECONDS, OUTCOME])
+    return tabulate(title, rows, ["trial", *keys, *known((SUCCESS, VIOLATING, COST, SECONDS, OUTCOME), rows)])
 
 
 def _picture(rows: Sequence[Row], space: SearchSpace) -> bytes:

@@ -59,7 +59,8 @@ class Practice(Model):
         "error equals its tolerance and the others are zero",
     )
     normalize_observations: Flag = Field(
-        default=True, description="whether networks see observations in units of their spread"
+        default=True,
+        description="whether networks see observations in units of their spread; with start_from, as it does",
     )
 
 

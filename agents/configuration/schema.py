@@ -77,11 +77,14 @@ class DemonstrationSource(Model):
     misses. Demonstrations may therefore have to meet stricter ones.
     """
 
-    problems: Many = Field(default=1000, description="problems to solve; few of them fail")
+    problems: Many = Field(
+        default=1000, description="problems to solve, unless there is folder or minari; few of them fail"
+    )
     seed: StrictInt | None = Field(
         default=None,
         ge=0,
-        description="seed of their starts; absent: the run's, so that each run draws its own",
+        description="seed of their starts, unless there is folder or minari; absent: the run's, so that each "
+        "run draws its own",
     )
     tolerance_scale: Positive = Field(
         default=1.0, description="tolerances of success that they meet, relative to the scene's, at most 1"

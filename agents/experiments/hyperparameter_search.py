@@ -57,9 +57,10 @@ class Found(NamedTuple):
 
 
 def score(point: Mapping[str, Any]) -> float:
-    """Objective of a point of the learning curve: more successes win, and a tie goes to the lower cost."""
+    """Objective of a point of the learning curve: more successes, less violations, then the lower cost."""
     cost = max(float(point["median_cost"]), 0.0)
-    return float(point["success_rate"]) + (TIE / (1.0 + cost) if np.isfinite(cost) else 0.0)
+    share = float(point["success_rate"]) - (point.get("violating_episodes") or 0.0)
+    return share + (TIE / (1.0 + cost) if np.isfinite(cost) else 0.0)
 
 
 def search(
@@ -204,6 +205,7 @@ class _Search:
             self._study.tell(trial.number, state=TrialState.FAIL)
             self._overview.end({"folder": "", "outcome": FAILED})  # it has none
             return
+        (task.folder / PRUNE).unlink(missing_ok=True)  # it is decided anew
         with self._lock:
             self._under_way[str(task.folder)] = trial, task
         yield task

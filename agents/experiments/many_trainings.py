@@ -30,9 +30,10 @@ _PARTS = 1000  # of a training, in the bar
 SUCCESS = Column("success_rate", "success\n%", lambda share: f"{100.0 * share:.1f}")
 COST = Column("median_cost", "cost", ".5g")
 SECONDS = replace(COLUMNS["training_seconds"], key="seconds")
+VIOLATING = Column("violating_episodes", "violating\n%", SUCCESS.format)
 OUTCOME = Column("outcome", "")
 _STEPS = Column("environment_steps", "environment\nsteps", COLUMNS["training_steps"].format)
-_COLUMNS = ("agent", "seed", SUCCESS, COST, _STEPS, SECONDS, OUTCOME)
+_COLUMNS = ("agent", "seed", SUCCESS, VIOLATING, COST, _STEPS, SECONDS, OUTCOME)
 
 
 class Overview:
@@ -177,7 +178,13 @@ def training_executor(
 
 def trainings_table(rows: Sequence[Row]) -> TextTable:
     """A table of trainings."""
-    return tabulate("Trainings, flown from validation starts; cost: median", rows, _COLUMNS)
+    return tabulate("Trainings, flown from validation starts; cost: median", rows, known(_COLUMNS, rows))
+
+
+def known(columns: Sequence[Column | str], rows: Sequence[Row]) -> list[Column | str]:
+    """The columns without that of violations where nothing can be violated."""
+    can_violate = any(row.get(VIOLATING.key) is not None for row in rows)
+    return [each for each in columns if can_violate or each is not VIOLATING]
 
 
 def seeds_table(summaries: Sequence[Row]) -> TextTable:

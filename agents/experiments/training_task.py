@@ -34,7 +34,7 @@ PRUNE = "prune"
 BETWEEN_NOTES, PATIENCE = 1.0, 10.0  # s
 _PACKAGES = ("sb3-contrib", "stable-baselines3", "torch")
 _EXPECTED = (DemonstrationsError, DivergedError, OSError, RunFolderError, ValueError)
-_MEASURED = ("success_rate", "median_cost", "environment_steps", "seconds")
+_MEASURED = ("success_rate", "median_cost", "violating_episodes", "environment_steps", "seconds")
 
 
 class _Pruned(Exception):  # noqa: N818 - an event, not a mistake

@@ -222,6 +222,7 @@ class Trainer(Generic[N]):
             record |= watch(self._network, record, self._is_done)
         self.history.append(record)
         reporter.tell(self._updates, record)
+        self._begin = perf_counter() - self._seconds  # validation is no training
 
     def _validate(self, validation: Source) -> Record:
         rng = np.random.default_rng(self._seed)

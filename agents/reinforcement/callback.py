@@ -151,7 +151,9 @@ class TrainingCallback(BaseCallback):
 
     def evaluate(self) -> None:
         """Add a line to the learning curve, and keep the policy if it is the best so far."""
+        begun = perf_counter()
         found = validate(as_policy(self.model).act, self._scene, self._seeds)
+        self._started += perf_counter() - begun  # flights are no training
         environment = self.model.get_env()
         if isinstance(environment, Lagrangian):
             found["multiplier"] = environment.multiplier

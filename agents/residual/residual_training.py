@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
+from agents.configuration import ConfigurationError
 from agents.configuration.residual import ResidualConfiguration
 from agents.demonstrations import check_gains, expert_seconds, prepare_demonstrations
 from agents.evaluation.plan_followers import follower
@@ -29,6 +31,8 @@ from agents.wrappers.shaping import action_scale
 from agents.wrappers.vector import ShapeReward
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.progress import Advance
+from dq_space_arm_env.environment.disturbances import with_loads
+from dq_space_arm_env.validation.problems import problem_list
 from experts.demonstrations import Demonstrations
 
 VALIDATION_SEED = 1
@@ -44,6 +48,13 @@ def train_residual(
 ) -> Trained:
     """Train a correction; an interrupted run resumes from its last checkpoint."""
     scene = load_scene(configuration.scene)
+    # What is wrong is said before any problem is solved.
+    try:
+        learner = configuration.learner()
+    except ValidationError as error:
+        raise ConfigurationError(problem_list(f"configuration {configuration.name!r}", error)) from error
+    largest_actions(configuration.environment.action_scale, scene)
+    with_loads(scene, configuration.mismatch.mass_factors)
     folder = RunFolder(Path(out), configuration)
     demonstrations = prepare_demonstrations(
         configuration.demonstrations, scene, folder.path / DEMONSTRATIONS, progress=report
@@ -51,7 +62,6 @@ def train_residual(
     check_gains(demonstrations, "corrected plans fly with: generate others")
     practiced, kept = split(demonstrations, configuration.schedule.evaluation_episodes)
     environment = make_residual_environment(configuration, scene, practiced)
-    learner = configuration.learner()
 
     def begin() -> tuple[BaseAlgorithm, Progress]:
         model = make_learner(learner, environment)

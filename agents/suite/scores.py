@@ -80,9 +80,10 @@ class Score:
     @property
     def _commits(self) -> list[str]:
         """Hashes of the commits that the policies were trained at, as far as they tell, sorted."""
-        origins = [row.evaluation.metadata.get("provenance") or {} for row in self.rows]
-        commits = [origin.get("commit") or {} for origin in origins]
-        return sorted({str(commit["hash"]) for commit in commits if "hash" in commit})
+        found: list[Any] = [row.evaluation.metadata for row in self.rows]
+        for key in ("provenance", "commit", "hash"):  # of policies of others it may be anything
+            found = [each.get(key) for each in found if isinstance(each, Mapping)]
+        return sorted({each for each in found if isinstance(each, str)})
 
     @property
     def _shares(self) -> NDArray[np.float64]:

@@ -162,7 +162,15 @@ def _policy(data: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]]) -> Exp
     module, options = str(data["policy_class"]["__module__"]), _checked_options(data)
     if module not in _POLICIES:
         raise NeedsCodeError(f"its policy is a class of {module[:80]!r}, not of Stable-Baselines3")
-    actor = next((each for each in _ACTORS if any(name.startswith(each.layers) for name in tensors)), None)
+    # Without hidden layers there is the last alone.
+    actor = next(
+        (
+            each
+            for each in _ACTORS
+            if f"{each.last}.weight" in tensors or any(name.startswith(each.layers) for name in tensors)
+        ),
+        None,
+    )
     if actor is None:
         raise NeedsCodeError("its network is none of PPO, A2C, SAC, TQC, TD3 or DDPG")
     weights, biases = _layers(actor, tensors)

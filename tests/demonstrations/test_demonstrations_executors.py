@@ -80,3 +80,16 @@ def test_tasks_are_taken_few_at_a_time(quick_scene: Scene):
             break
     results.close()
     assert len(taken) <= 7
+
+
+def test_the_next_task_may_depend_on_the_last_result(quick_scene: Scene):
+    settings, events = Settings.of(quick_scene, 3, 3, 1), []
+
+    def tasks() -> Iterator[Task]:
+        for shard in range(settings.n_shards):
+            events.append("asked")
+            yield Task(settings, shard)
+
+    for _ in ProcessExecutor(1).run(tasks()):
+        events.append("told")
+    assert events == ["asked", "told"] * 3

@@ -318,8 +318,9 @@ def test_scores_by_hand(content):
 
 
 def test_the_page_tells_at_which_commits_policies_were_trained(content):
-    score = made([[True]] * 4, [[0.0]] * 4)
+    score = made([[True]] * 6, [[0.0]] * 6)
     origins = [{"commit": {"hash": "b" * 40}}, {"commit": {"hash": "a" * 40}}, {"commit": None}, None]
+    origins += ["our lab", {"commit": "our own"}]
     rows = tuple(
         replace(row, evaluation=replace(row.evaluation, metadata={"provenance": origin}))
         for row, origin in zip(score.rows, origins, strict=True)

@@ -218,6 +218,24 @@ def test_more_successes_win_and_a_tie_goes_to_the_lower_cost() -> None:
     assert len(set(scores)) == len(scores)
 
 
+def test_flights_that_violate_count_against_successes() -> None:
+    careless = {"success_rate": 0.99, "median_cost": 1.0, "violating_episodes": 0.9}
+    assert score(careless) < score({"success_rate": 0.98, "median_cost": 1.0, "violating_episodes": 0.0})
+
+
+def test_a_trial_that_was_given_up_is_not_where_nothing_is(
+    configuration: AgentConfiguration, tmp_path: Path
+) -> None:
+    """Its folder still says so after an interrupt."""
+    pytest.importorskip("optuna")
+    space = SearchSpace.model_validate({"search": {"algorithm.learning_rate": {"low": 1e-3, "high": 1e-2}}})
+    folder = tmp_path / "trials" / f"{configuration.name}-trial-0-{configuration.seed}"
+    folder.mkdir(parents=True)
+    (folder / PRUNE).touch()
+    found = search(configuration, space, 1, tmp_path, prune=False, executor=SerialExecutor())
+    assert [(row["outcome"], row["folder"]) for row in found.trials] == [("trained", str(folder))]
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [

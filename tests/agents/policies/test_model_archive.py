@@ -169,9 +169,9 @@ def test_nothing_is_executed_from_python_either(plain, own, tmp_path):
     assert as_policy(own, trust=True).act(np.zeros((3, 14), np.float32)).shape == (3, 6)
 
 
-@pytest.mark.parametrize("name", LEARNERS)
-def test_the_tensors_act_like_the_model(name, small_scene, tmp_path):
-    model = learner(LEARNERS[name], small_scene)
+@pytest.mark.parametrize(("name", "hidden"), [*((name, [16, 16]) for name in LEARNERS), ("PPO", [])])
+def test_the_tensors_act_like_the_model(name, hidden, small_scene, tmp_path):
+    model = learner(LEARNERS[name], small_scene, policy_kwargs={**NETWORK, "net_arch": hidden})
     model.save(tmp_path / "model.zip")
     seen = np.random.default_rng(0).normal(size=(50, 14)).astype(np.float32)
     expected = np.clip(model.predict(seen, deterministic=True)[0], -1.0, 1.0)

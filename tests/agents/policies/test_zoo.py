@@ -43,6 +43,9 @@ def test_a_policy_whose_scene_is_elsewhere_names_it():
     policy = replace(load_policy("ppo"), metadata={"scene": "own/my.yaml"})
     with pytest.raises(PolicyError, match=r"was trained in own/my\.yaml, which is not here: give scene"):
         scene_of([as_policy(policy)])
+    for scene in ("x" * 300, "a\0b"):
+        with pytest.raises(PolicyError, match="which is not here: give scene"):
+            scene_of([as_policy(replace(policy, metadata={"scene": scene}))])
 
 
 @pytest.mark.parametrize("name", list_policies())

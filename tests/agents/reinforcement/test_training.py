@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from agents.reinforcement.callback import TrainingCallback
 from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.reinforcement_training import make_environment, make_learner
-from agents.run_folder import DivergedError, RunFolder, RunFolderError, reserved
+from agents.run_folder import DivergedError, RunFolder, RunFolderError, reserved, validate
 from agents.training import train
 from agents.zoo.finding import as_policy, read_policy
 from dq_space_arm_env import load_scene
@@ -395,6 +396,21 @@ def test_a_run_whose_time_is_up_resumes_to_the_same_weights(trained, scene_file,
     run = train(settings, tmp_path)
     for actual, expected in zip(state_of(run.model), state_of(trained("PPO").model), strict=True):
         np.testing.assert_array_equal(actual, expected)
+
+
+def test_flights_are_no_training(scene_file, tmp_path, monkeypatch):
+    flown = [0.0]
+
+    def slow(*arguments):
+        flown[0] += 1e6
+        return validate(*arguments)
+
+    monkeypatch.setattr("agents.reinforcement.callback.validate", slow)
+    monkeypatch.setattr("agents.reinforcement.callback.perf_counter", lambda: perf_counter() + flown[0])
+    train(configuration("PPO", scene_file), tmp_path)
+    curve = [json.loads(line) for line in (tmp_path / "evaluations.jsonl").read_text().splitlines()]
+    assert len(curve) > 1
+    assert 0.0 < curve[-1]["seconds"] < 1e6
 
 
 def test_a_run_whose_time_is_up_where_it_evaluates_does_so_once(scene_file, tmp_path, monkeypatch):

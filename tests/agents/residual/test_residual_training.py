@@ -10,7 +10,7 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
 
-from agents.configuration import load_configuration
+from agents.configuration import ConfigurationError, load_configuration
 from agents.evaluation.plan_followers import follower
 from agents.evaluation.plans import Plans
 from agents.policies import ExportedPolicy
@@ -255,3 +255,13 @@ def test_a_folder_or_a_scene_that_does_not_fit_is_refused(configuration, tmp_pat
         train_residual(configuration(seed=1), tmp_path / "run")
     with pytest.raises(DemonstrationsError, match="demonstrations of another scene than 'paper'"):
         train_residual(configuration(scene="paper"), tmp_path / "other")
+
+
+def test_what_is_wrong_is_said_before_any_problem_is_solved(configuration, monkeypatch, tmp_path):
+    monkeypatch.setattr("agents.residual.residual_training.prepare_demonstrations", None)
+    with pytest.raises(ValueError, match="wheel_torque"):
+        train_residual(configuration(environment={"action_scale": {"wheel_torque": 0.1}}), tmp_path)
+    monkeypatch.setitem(ALGORITHMS["residual-SAC"], "layer_norm", True)
+    flat = {"hidden": [], "activation": "relu"}
+    with pytest.raises(ConfigurationError, match=r"network\.hidden = \[\]: must have a layer"):
+        train_residual(configuration("residual-SAC", network=flat), tmp_path)
