@@ -152,7 +152,7 @@ class KinematicTree:
     tip_wrench: tuple[float, ...] | None  # force [N], torque [N m] at G, in G axes (16)
     planar: bool  # the base moves in its x-y plane only
     heaviest: int = 0  # body of greatest nominal mass: 0 is the base, i link i
-    heavy_base: bool = False  # its nominal mass is beyond 100 times that of all links
+    heavy_base: bool = False  # its nominal mass is beyond 100 times that of the first link and all it carries
     jets: tuple[Jet, ...] = ()  # thrusters
     wheels: tuple[Wheel, ...] = ()  # free to turn: the base's inertia is without their axial ones
     tank: Vector | None = None  # where propellant is that the base does not contain, in its frame, m
@@ -214,10 +214,11 @@ class KinematicTree:
         tip_body, at = places[scene.tip_body]
         wrist = None if scene.wrist is None else _placement(scene.wrist.frame).within(at)
         tip = _placement(scene.tip)
+        links = tuple(_links(scene, given, places, bodies))
         others = [(places[scene.body_named(each.link)], _placement(each.frame)) for each in scene.other_tips]
         return cls(
             base=replace(bodies[0], inertia=free_inertia(bodies[0].inertia, wheels)) if wheels else bodies[0],
-            links=tuple(_links(scene, given, places, bodies)),
+            links=links,
             tip_body=tip_body,
             wrist=wrist,
             tip=tip if wrist is not None else tip.within(at),
@@ -225,7 +226,7 @@ class KinematicTree:
             tip_wrench=None if wrench is None else (*wrench.force, *wrench.torque),
             planar=scene.base.motion == "planar",
             heaviest=masses.index(max(masses)),
-            heavy_base=masses[0] > 100.0 * sum(masses[1:]),
+            heavy_base=masses[0] > 100.0 * _carried_mass(links, masses),
             jets=tuple(
                 Jet(each.unit_direction, each.moment, 0.0 if tank is None else each.mass_flow)
                 for each in scene.actuators.thrusters or ()
@@ -234,6 +235,15 @@ class KinematicTree:
             tank=None if tank is None else tank.position,
             places=tuple(places),
         )
+
+
+def _carried_mass(links: Sequence[JointedLink], masses: Sequence[float]) -> float:
+    """Nominal mass of the first link and of what it carries; 0 without links."""
+    carried = {1}
+    for body, link in enumerate(links, 1):
+        if link.parent in carried:
+            carried.add(body)
+    return sum(masses[body] for body in carried) if links else 0.0
 
 
 Places = list[tuple[int, Placement | None]]

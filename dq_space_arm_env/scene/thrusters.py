@@ -63,11 +63,10 @@ class Thruster(Model):
         """Propellant that leaves per force and time, 1 / (I_sp g0), s/m; 0 where it is not counted."""
         return 0.0 if self.specific_impulse is None else 1.0 / (self.specific_impulse * STANDARD_GRAVITY)
 
-    @property
-    def impulse_bit(self) -> float:
-        """Impulse of the shortest pulse, N s."""
+    def impulse_bit(self, force: Any) -> Any:
+        """Impulse of the shortest pulse, N s, of a thruster with a largest force, N; 0 for any."""
         if self.minimum_on_time is not None:
-            return self.minimum_on_time * self.force
+            return self.minimum_on_time * force
         return self.minimum_impulse or 0.0
 
 
@@ -127,7 +126,7 @@ def thruster_problems(scene: Scene) -> Iterator[Problem]:
         if names[index] in names[:index]:
             yield Problem((*here, "name"), names[index], "another thruster has this name")
         most = thruster.force * scene.simulation.dt
-        if thruster.impulse_bit > (1.0 + 1e-12) * most:
+        if thruster.impulse_bit(thruster.force) > (1.0 + 1e-12) * most:
             field = "minimum_impulse" if thruster.minimum_on_time is None else "minimum_on_time"
             sentence = f"never fires: with the largest force a time step has an impulse of {most:g} N s"
             yield Problem((*here, field), getattr(thruster, field), sentence)

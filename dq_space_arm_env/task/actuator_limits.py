@@ -34,7 +34,9 @@ def reads_state(scene: Scene) -> bool:
 
 def are_ideal(scene: Scene) -> bool:
     """Tell whether actuators apply all that is asked of them within their limits."""
-    return not reads_state(scene) and not any(jet.impulse_bit for jet in scene.actuators.thrusters or ())
+    return not reads_state(scene) and not any(
+        jet.impulse_bit(jet.force) for jet in scene.actuators.thrusters or ()
+    )
 
 
 def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
@@ -47,9 +49,10 @@ def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
         result[part] = _wheel_torques(equations, x, result[part])
     first = equations.layout.control.thruster_force.start
     for index, thruster in enumerate(scene.actuators.thrusters or (), first):
-        if thruster.impulse_bit:
+        if thruster.impulse_bit(thruster.force):
             # A pulse of the largest force with the impulse f h; one of the shortest is rounded into it.
-            least = (1.0 - 1e-12) * thruster.impulse_bit / scene.simulation.dt
+            shortest = thruster.impulse_bit(equations.control_limits[index])
+            least = (1.0 - 1e-12) * shortest / scene.simulation.dt
             result[index] = casadi.if_else(result[index] < least, 0.0, result[index])
     if scene.actuators.tank is not None:
         _burn(equations, x, result)

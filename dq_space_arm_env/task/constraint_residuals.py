@@ -55,6 +55,8 @@ Scalars = Sequence[Scalar]
 
 SMALLEST_LENGTH = 1e-3
 """Length, m, by which a cone is wider at its apex, where its residual is rounded off."""
+_ROUNDING = {"float64": 1e-12, "float32": 1e-6}
+"""More than what rounding takes off 1 - sin^2 where that is 0."""
 MEETING = 1e-4
 """Distance, m, that stands for none between centers or axes of volumes."""
 
@@ -250,7 +252,7 @@ def _cone_of_gas(situation: Situation, constraint: Plume, place: Scalars) -> tup
     square = dot(d, d) + SMALLEST_LENGTH**2
     nearest = select(square > sphere.radius**2, square, sphere.radius**2)
     sine, half = sphere.radius / sqrt(nearest), math.radians(constraint.angle_deg)
-    cosine = sqrt(1.0 - sine * sine + 1e-12)
+    cosine = sqrt(1.0 - sine * sine + _ROUNDING[situation.scene.simulation.precision])
     sine_of_both = math.sin(half) * cosine + math.cos(half) * sine
     cosine_of_both = math.cos(half) * cosine - math.sin(half) * sine
     return sine_of_both, cosine_of_both, scale(1.0 / sqrt(square), d)
@@ -281,13 +283,15 @@ def _wheel_limits(situation: Situation, constraint: WheelLimits) -> Iterator[Sca
     """
     motion, tree = situation.motion, situation.equations.tree
     found = reaction_wheels.speeds(tree.wheels, motion.wheel_momenta, motion.angular)
-    given = situation.scene.actuators.wheels or ()
-    for wheel, speed, torque in zip(given, found, situation.inputs.wheel_torques, strict=True):
+    given, equations = situation.scene.actuators.wheels or (), situation.equations
+    limits = equations.control_limits[equations.layout.control.wheel_torque]
+    torques = situation.inputs.wheel_torques
+    for wheel, speed, torque, most_torque in zip(given, found, torques, limits, strict=True):
         if math.isfinite(wheel.speed):
             yield -speed - wheel.speed
             yield speed - wheel.speed
         if math.isfinite(wheel.power):
-            corner = wheel.power / wheel.torque if math.isfinite(wheel.torque) else 1.0
+            corner = wheel.power / most_torque if math.isfinite(wheel.torque) else 1.0
             size = select(speed > 0.0, speed, -speed)
             most = wheel.power / select(size > 0.5 * corner, size, 0.5 * corner)
             yield corner * (-torque - most)

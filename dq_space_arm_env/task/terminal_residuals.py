@@ -129,8 +129,8 @@ def charged(scene: Scene, residuals: Scalars, at_end: Scalar) -> tuple[Scalar, S
     """
     cost, ends = 0.0, False
     rows = (*path_rows(scene), *exact_rows(scene))
-    for row, c in zip(rows, residuals, strict=True):
-        violation = casadi.if_else(at_end, casadi.fabs(c), 0.0) if row.is_equality else casadi.fmax(c, 0.0)
+    for row, c in zip(rows, residuals, strict=True):  # NaN stays: maxima are the second number then
+        violation = casadi.if_else(at_end, casadi.fabs(c), 0.0) if row.is_equality else casadi.fmax(0.0, c)
         cost = cost + violation / row.tolerance
         if row.terminates:
             ends = casadi.logic_or(ends, c > row.tolerance)

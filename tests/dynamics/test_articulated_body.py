@@ -94,3 +94,31 @@ def test_one_refinement_brings_back_what_needles_cost_the_schur_complement_21():
 
     assert error(0) > 1e-12
     assert error(1) < 1e-14
+
+
+def test_a_light_first_link_beside_an_arm_costs_no_digits():
+    """The base is no worse a root for the arm, whose mass does not count against it."""
+    links = [
+        {
+            "name": "flap",
+            "mass": 1e-9,
+            "inertia": [1e-10, 1.5e-10, 1.2e-10],
+            "center_of_mass": [0.3, 0.2, 0.1],
+        },
+        {"name": "arm", "mass": 20.0, "inertia": [1.0, 1.2, 0.8], "center_of_mass": [0.4, 0.1, 0.0]},
+    ]
+    for link, angle in zip(links, (50, 70), strict=True):
+        place = {"position": [0.5, 0.3, 0.2], "rotation": {"axis": [0.2, 1.0, 0.3], "angle": angle}}
+        link |= {"parent": "base", "joint": place}
+    base = {"mass": 200.0, "inertia": [20.0, 22.0, 18.0]}
+    found = []
+    for order in (links, links[::-1]):
+        scene = {"name": "flap", "base": base, "links": order, "tip_link": "arm", "target": {"pose": {}}}
+        tree = KinematicTree.from_scene(load_scene(scene))
+        step = 1 if order is links else -1
+        frames = minimal.link_frames(tree, [0.4, 0.3][::step])
+        solved = inertia_of("articulated_body", tree, frames).solve(
+            (100.0, 50.0, -80.0), (4.0, -3.0, 2.0), [1e-10, 1.0][::step]
+        )
+        found.append(np.array([*solved.angular, *solved.linear, *solved.joints[::step]]))
+    np.testing.assert_allclose(*found, rtol=1e-12)

@@ -14,6 +14,7 @@ from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, terminal_rows
 from dq_space_arm_env.scene.constraints import Volume
+from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.constraint_residuals import _Segment, _segment_distance
 from dq_space_arm_env.task.equations import SceneEquations
 from dq_space_arm_env.task.terminal_residuals import terminal_residuals
@@ -369,3 +370,47 @@ def test_joint_limits_of_no_joints_are_refused() -> None:
     scene = {"name": "body", "target": {"pose": {}}, "constraints": [limits]}
     with pytest.raises(SceneError, match=r"constraints\[0\].*must bound something"):
         load_scene({**scene, "base": {"mass": 10.0, "inertia": [1.0, 1.0, 1.0]}})
+
+
+def test_gas_from_within_a_sphere_is_charged_in_single_precision() -> None:
+    """The radius over its own root of a square is rounded to more than 1 there."""
+    sphere = {"frame": "inertial", "position": [0.1, 0.0, 0.0], "radius": 0.27}
+    plume = {"kind": "plume", "name": "gas", "thruster": [0, 0, 0], "angle_deg": 30.0, "keeps_clear": sphere}
+    scene = load_scene("planar").replace(constraints=[plume], simulation={"precision": "float32"})
+    kernels = compile_scene(scene)
+    u = np.array([-1.0, *[0.0] * (kernels.n_u - 1)], np.float32)
+    x, double = kernels.layout.initial_state, scene.replace(simulation={"precision": "float64"})
+    assert kernels.constraints(x, u) == pytest.approx(compile_scene(double).constraints(x, u), rel=1e-3)
+
+
+JET = {"position": [0, 0, 0], "direction": [1, 0, 0], "force": 2.0, "minimum_on_time": 0.005}
+
+
+@pytest.mark.parametrize(
+    ("actuators", "constraints", "p", "u"),
+    [
+        (
+            {"wheels": [{"axis": [0, 0, 1], "inertia": 0.01, "torque": 0.5, "power": 10.0}]},
+            [{"kind": "wheel_limits", "name": "wheel"}],
+            5.0,
+            [5.0],
+        ),
+        ({"thrusters": [JET]}, [], 20.0, [2.0]),
+    ],
+)
+def test_largest_torques_and_forces_that_vary_are_those_of_the_episode(actuators, constraints, p, u) -> None:
+    scene = load_scene(
+        {
+            "name": "body",
+            "base": {"motion": "planar", "mass": 20.0, "inertia": [1.0, 1.0, 1.0]},
+            "target": {"pose": {}},
+            "actuators": actuators,
+            "parameters": ["actuators"],
+            "constraints": constraints,
+            "simulation": {"dt": 0.02, "steps": 10},
+        }
+    )
+    varying, own = compile_scene(scene), compile_scene(episode_scene(scene, [p]))
+    x = own.layout.initial_state
+    np.testing.assert_allclose(varying.applied_inputs(x, u, p=[p]), own.applied_inputs(x, u))
+    np.testing.assert_allclose(varying.constraints(x, u, p=[p]), own.constraints(x, u))
