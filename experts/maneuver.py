@@ -62,6 +62,7 @@ class Maneuver:
     scene: Scene
     states: FloatArray
     controls: FloatArray
+    caught: bool = True  # whether no catch has failed
 
     @cached_property
     def time(self) -> FloatArray:
@@ -83,7 +84,7 @@ class Maneuver:
     def payload(self) -> FloatArray | None:
         """Poses of the payload where phases have it, shape (N + 1, 8), m; None if it is at the tip."""
         target = np.atleast_2d(np.transpose(self.target))
-        return payload_path(self.scene, self.frames[:, -1], target)
+        return payload_path(self.scene, self.frames[:, -1], target, self.caught)
 
     @cached_property
     def error_pose(self) -> FloatArray:

@@ -9,7 +9,7 @@ import click
 from dq_space_arm_env.command_line.names import SCENE, OneOf
 from dq_space_arm_env.command_line.verb import json_option
 from dq_space_arm_env.command_line.verb_program import run_to_end
-from dq_space_arm_env.common.files import check_writable, check_writable_file
+from dq_space_arm_env.common.files import check_writable_file
 from dq_space_arm_env.scene import INTEGRATORS, load_scene
 from experts.report import reproduction
 
@@ -51,7 +51,8 @@ def reproduce(
     if integrator is not None:
         loaded = loaded.replace(simulation={"integrator": integrator})
     folder = out or reproduction.results_folder(scene)
-    check_writable(folder)
+    for name in reproduction.FILES:
+        check_writable_file(folder / name, scene)
     if readme_picture is not None:
         check_writable_file(readme_picture)
     return reproduction.run(

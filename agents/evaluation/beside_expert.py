@@ -89,7 +89,8 @@ def fly_beside_expert(policy: ActingPolicy, scene: Scene, seeds: list[int | None
             raise ValueError(f"{policy.label} gives NaN in place of an action")
         path, parameters = flown.trajectory(), flown.parameters[0]
         flown_in = episode_scene(scene, parameters.tolist())
-        maneuver = Maneuver(flown_in, path.states, path.controls)
+        caught = flown.caught is None or bool(flown.caught[0])
+        maneuver = Maneuver(flown_in, path.states, path.controls, caught)
         agent = Side(policy.label, maneuver, path.cost, path.is_success, action_seconds)
         started = perf_counter()
         solution = uninterrupted(solver.solve(path.states[0], parameters=parameters))

@@ -18,6 +18,7 @@ from experts.figures.style import (
     LIMIT_STYLE,
     VERMILION,
     WIDTH,
+    plain,
 )
 from experts.maneuver import ActuatorHistory
 from experts.report.maneuver_summary import ACTUATOR_TITLES
@@ -44,7 +45,7 @@ def errors_figure(pair: SideBySide) -> Figure:
         axes.set_yscale("log")
         axes.set_xlabel("time [s]")
     handles = [
-        Line2D([], [], color=VERMILION, label=f"{pair.agent.name}: J = {pair.agent.cost:.6g}"),
+        Line2D([], [], color=VERMILION, label=f"{plain(pair.agent.name)}: J = {pair.agent.cost:.6g}"),
         Line2D([], [], color=BLUE, linestyle=_DASHED, label=f"expert: J = {pair.expert.cost:.6g}"),
         Line2D([], [], **{**LIMIT_STYLE, "label": "tolerance"}),
     ]
@@ -65,7 +66,7 @@ def inputs_figure(pair: SideBySide) -> Figure:
     for axes in panels[len(actuators) :]:
         axes.remove()
     handles = [
-        Line2D([], [], color=BLACK, label=pair.agent.name),
+        Line2D([], [], color=BLACK, label=plain(pair.agent.name)),
         Line2D([], [], color=BLACK, linestyle=_DASHED, label="expert"),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=2)

@@ -19,7 +19,7 @@ from agents.evaluation.comparing import Comparison, Row
 from agents.evaluation.statistics import Interval, performance_profile
 from agents.evaluation.training_runs import agent_of
 from experts.figures.plots import MARKERS, PALETTE
-from experts.figures.style import LIMIT_STYLE, WIDTH
+from experts.figures.style import LIMIT_STYLE, WIDTH, plain
 
 FLOOR = 0.01
 """Smaller cost gaps are drawn here, %."""
@@ -89,7 +89,7 @@ def _looks(rows: Sequence[Row]) -> Looks:
 
 def _add_legend(figure: Figure, looks: Looks, title: str, suffixes: Mapping[str, str] | None = None) -> None:
     handles = [
-        Line2D([], [], linestyle="", label=name + (suffixes or {}).get(name, ""), **look)
+        Line2D([], [], linestyle="", label=plain(name) + (suffixes or {}).get(name, ""), **look)
         for name, look in looks.items()
     ]
     figure.legend(

@@ -15,7 +15,7 @@ from agents.evaluation.comparing import Row as ComparedRow
 from agents.evaluation.evaluating import Evaluation, known_interval
 from agents.evaluation.statistics import performance_profile, probability_of_improvement
 from agents.evaluation.training_runs import Group
-from dq_space_arm_env.common.tables import Column, Row, TextTable, tabulate
+from dq_space_arm_env.common.tables import Column, Row, TextTable, one_line, tabulate
 
 
 def percent(interval: Sequence[float | None]) -> str:
@@ -234,11 +234,12 @@ def notes(comparison: Comparison) -> list[str]:
 
 def markdown(title: str, tables: Sequence[TextTable], comparison: Comparison) -> str:
     """A comparison as Markdown: tables, notes and commands."""
-    blocks = [f"# {title}, scene {comparison.scene}"]
+    blocks = [f"# {title}, scene {one_line(comparison.scene)}"]
     for table in tables:
         blocks += table.markdown()
     commands = "\n".join(["```bash", *comparison.commands, "```"])
-    return "\n\n".join([*blocks, *notes(comparison), "Commands that reproduce the rows:", commands]) + "\n"
+    blocks += map(one_line, notes(comparison))
+    return "\n\n".join([*blocks, "Commands that reproduce the rows:", commands]) + "\n"
 
 
 def record(comparison: Comparison) -> dict[str, Any]:

@@ -347,7 +347,7 @@ def import_(
     path = _scene_file(out or f"{Path(robot).stem}.yaml", force or tip is None, robot)
     arguments["name"] = arguments.get("name") or path.stem
     if replay:
-        check_writable_file(path.with_suffix(".html"))
+        _check_free(path.with_suffix(".html"), force, robot)
     spacecraft = given(mass=spacecraft_mass, inertia=spacecraft_inertia)
     if len(spacecraft) == 1:
         raise click.UsageError(

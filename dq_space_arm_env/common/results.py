@@ -34,14 +34,15 @@ class Destination:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         files, lines = [f"{name}.json"], []
+        repeats = (self.folder / files[0]).exists()
         write_atomically(self.folder / files[0], to_json(record))
         if self.picture and find_spec("matplotlib") is not None:
             for file, draw in pictures.items():
                 write_atomically(self.folder / file, draw())
                 files.append(file)
         elif pictures:
-            for file in pictures:
-                (self.folder / file).unlink(missing_ok=True)  # of an earlier run: it may show other results
+            for file in pictures if repeats else ():  # of an earlier run: it may show other results
+                (self.folder / file).unlink(missing_ok=True)
             lines += [NO_PICTURE] if self.picture else []
         return [*lines, f"{self.folder}: {', '.join(files)}"]
 

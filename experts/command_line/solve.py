@@ -9,7 +9,7 @@ import click
 from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option
 from dq_space_arm_env.command_line.verb import Interrupted, json_option
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, message_console, print_document, table_console
-from dq_space_arm_env.common.files import check_writable
+from dq_space_arm_env.common.files import check_writable_file
 
 
 @click.command(
@@ -60,6 +60,7 @@ def solve(
     from dq_space_arm_env.dynamics.step_stability import advice
     from dq_space_arm_env.environment.catches import ends_held
     from experts.command_line import solving
+    from experts.report.reproduction import FILES
 
     loaded = load_scene(scene)
     if (sentence := advice(loaded)) is not None:
@@ -67,7 +68,8 @@ def solve(
     if figures:
         solving.check_figures()
     folder = out or solving.default_folder(scene, seed)
-    check_writable(folder)
+    for name in FILES:
+        check_writable_file(folder / name, scene, start)
     run = solving.solve(
         loaded,
         message_console(),

@@ -22,16 +22,15 @@ from dq_space_arm_env.command_line.simulated_episode import (
     flown_catches,
 )
 from dq_space_arm_env.command_line.verb import keeping
-from dq_space_arm_env.common.files import json_value, to_json, write_atomically
+from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.tables import plain_table
 from dq_space_arm_env.environment.catches import Catch, ends_held
 from dq_space_arm_env.scene import StateLayout
 from experts import BoxDDP, GuidedDDP, Solution, StopReason
-from experts.maneuver import FIGURES, Maneuver
+from experts.maneuver import Maneuver
 from experts.problems.arm_problem import ArmProblem
-from experts.report import SolveProgress
-from experts.report.reproduction import results_folder
+from experts.report import SolveProgress, reproduction
 
 AS_IF_CAUGHT = "as if the payload were caught; `dq-space-arm simulate` flies on without it"
 TO_CATCH = (
@@ -82,7 +81,7 @@ def check_figures() -> None:
 
 def default_folder(scene: str, seed: int | None) -> Path:
     """Name the folder of a solution of a scene, given by its name or file."""
-    folder = results_folder(scene, "solutions")
+    folder = reproduction.results_folder(scene, "solutions")
     return folder if seed is None else folder.with_name(f"{folder.name}-{seed}")
 
 
@@ -128,19 +127,13 @@ def _final_errors(scene: Scene, solution: Solution) -> tuple[float, ...]:
 
 def save(run: SolveRun, folder: Path, *, figures: bool) -> list[Path]:
     """Write the files of a run."""
-    folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / name for name in ("solution.npz", "scene.yaml", "summary.json")]
-    run.solution.save(files[0])
-    write_atomically(files[1], run.start.episode_scene.to_yaml())
-    write_atomically(files[2], to_json({**record(run), **provenance()}))
+    summary = {**record(run), **provenance()}
+    files = reproduction.save(run.solution, run.start.episode_scene, summary, folder)
     if figures and math.isfinite(run.solution.cost):
         from experts.figures import write_figures
 
         maneuver = Maneuver(run.start.episode_scene, run.solution.states, run.solution.controls)
         files += write_figures(maneuver, folder)
-    else:
-        for name in FIGURES:  # of an earlier run: they show another trajectory
-            (folder / f"{name}.png").unlink(missing_ok=True)
     return files
 
 

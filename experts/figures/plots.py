@@ -18,6 +18,7 @@ from experts.figures.style import (
     LIMIT_STYLE,
     WIDTH,
     as_png,
+    plain,
 )
 
 PALETTE = (*COLORS, BLACK, GRAY)
@@ -57,17 +58,18 @@ class Plot:
         curves = list(dict.fromkeys(row[self.color] for row in rows)) if self.color else [None]
         columns = min(len(facets), self.columns)
         bars = self._has_bars(rows)
+        names = list(dict.fromkeys(row[self.y] for row in rows)) if bars else []  # alike in all panels
         lines, legend = -(-len(facets) // columns), -(-len(curves) // 4) if self.color else 0
         panel = _PANEL_HEIGHT
         if bars:
-            panel = 0.8 + _BAR_HEIGHT * len({row[self.y] for row in rows})
+            panel = 0.8 + _BAR_HEIGHT * len(names)
         size = (WIDTH, panel * lines + _LEGEND_LINE * (legend + 1))
         figure = Figure(figsize=size, layout="constrained")
         panels = list(figure.subplots(lines, columns, sharey="row" if bars else False, squeeze=False).flat)
         handles: dict[str, Any] = {}
         for axes, facet in zip(panels, facets, strict=False):
             own = [row for row in rows if self.facet is None or row[self.facet] == facet]
-            self._draw_panel(axes, facet, own, curves)
+            self._draw_panel(axes, facet, own, curves, names)
             handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
         for axes in panels[len(facets) :]:
             axes.remove()
@@ -84,22 +86,23 @@ class Plot:
     def _has_bars(self, rows: Sequence[Row]) -> bool:
         return any(isinstance(row[self.y], str) for row in rows)
 
-    def _draw_panel(self, axes: Axes, facet: Any, rows: Sequence[Row], curves: Sequence[Any]) -> None:
+    def _draw_panel(
+        self, axes: Axes, facet: Any, rows: Sequence[Row], curves: Sequence[Any], names: Sequence[str]
+    ) -> None:
         for axis in self.log:
             axes.set(**{f"{axis}scale": "log"})
-        bars = self._has_bars(rows)
         for level in self.levels:
-            (axes.axvline if bars else axes.axhline)(level, **LIMIT_STYLE)
-        if bars:
-            self._draw_bars(axes, rows, curves)
+            (axes.axvline if names else axes.axhline)(level, **LIMIT_STYLE)
+        if names:
+            self._draw_bars(axes, rows, curves, names)
         else:
             for index, curve in enumerate(curves):
                 own = [row for row in rows if self.color is None or row[self.color] == curve]
-                self._draw_curve(axes, own, index, None if curve is None else str(curve))
+                self._draw_curve(axes, own, index, None if curve is None else plain(curve))
             axes.set_ylabel(self._label(self.y), fontsize=8.5)
             axes.margins(x=0.05, y=0.08)
         if facet is not None:
-            axes.set_title(str(facet), loc="left", fontsize=9)
+            axes.set_title(plain(facet), loc="left", fontsize=9)
         axes.set_xlabel(self._label(self.x), fontsize=8.5)
         if self.decorate is not None:
             self.decorate(axes, facet)
@@ -123,20 +126,22 @@ class Plot:
                 low, high = ([self._height(row[key]) for row in own] for key in self.interval)
                 axes.vlines(x, low, high, color=look["color"], linewidth=1.0)
 
-    def _draw_bars(self, axes: Axes, rows: Sequence[Row], curves: Sequence[Any]) -> None:
-        names = list(dict.fromkeys(row[self.y] for row in rows))
+    def _draw_bars(
+        self, axes: Axes, rows: Sequence[Row], curves: Sequence[Any], names: Sequence[str]
+    ) -> None:
         height = 0.8 / len(curves)
         for index, curve in enumerate(curves):
             own = [row for row in rows if self.color is None or row[self.color] == curve]
             places = [names.index(row[self.y]) - 0.4 + (index + 0.5) * height for row in own]
+            label = None if curve is None else plain(curve)
             # Hatched, every other color is told apart in black and white too.
             look: dict[str, Any] = {"color": COLORS[index % len(COLORS)]}
             if index % 2:
                 look |= {"hatch": "////", "edgecolor": BLACK, "linewidth": 0.4}
-            axes.barh(places, [row[self.x] for row in own], height, label=curve, **look)
+            axes.barh(places, [row[self.x] for row in own], height, label=label, **look)
         if "x" in self.log:  # bars begin a decade below the shortest
             axes.set_xlim(left=0.1 * min(row[self.x] for row in rows))
-        axes.set_yticks(np.arange(len(names)), names, fontsize=8.5)
+        axes.set_yticks(np.arange(len(names)), [plain(name) for name in names], fontsize=8.5)
         axes.set_ylim(len(names) - 0.5, -0.5)
         axes.grid(visible=False, axis="y")
 

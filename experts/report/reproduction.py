@@ -4,15 +4,22 @@ import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from dq_space_arm_env.command_line.verb import Interrupted
 from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, print_document, table_console
 from dq_space_arm_env.common.files import to_json, write_atomically
 from dq_space_arm_env.scene import Scene
-from experts.ddp.solution import StopReason
+from experts.ddp.solution import Solution, StopReason
+from experts.maneuver import FIGURES
 from experts.report.maneuver_run import ManeuverRun, run_maneuver
 from experts.report.maneuver_summary import print_tables, summarize
 from experts.report.solve_progress import SolveProgress
+
+FILES = ("solution.npz", "scene.yaml", "summary.json")
+"""Files of a solve; the last one is there when the others are."""
+CONVERGENCE = "convergence"
+"""File of the figure of the solve, without suffix."""
 
 
 def run(
@@ -54,11 +61,10 @@ def run(
     if readme_picture is not None and readme_picture.suffix.lower() != ".png":
         raise ValueError(f"--readme-picture: {readme_picture}, should end in .png")
     console = table_console(stderr=as_json)
-    folder.mkdir(parents=True, exist_ok=True)
     with SolveProgress(console, scene) as progress:
         maneuver = run_maneuver(scene, max_iterations, progress.start, progress.update)
     try:
-        files = _save(maneuver, folder)
+        files = save(maneuver.solution, maneuver.scene, summarize(maneuver), folder)
         print_tables(console, maneuver)
         if figures and maneuver.is_finite:  # a diverged trajectory cannot be drawn
             files += _draw(maneuver, folder, ("png", "pdf") if pdf else ("png",), readme_picture)
@@ -79,12 +85,29 @@ def results_folder(scene: str, *parents: str) -> Path:
     return Path("results", *parents) / re.sub(r"[^\w.-]+", "-", Path(scene).stem)
 
 
-def _save(run: ManeuverRun, folder: Path) -> list[Path]:
-    solution, scene, summary = (folder / name for name in ("solution.npz", "scene.yaml", "summary.json"))
-    run.solution.save(solution)
-    write_atomically(scene, run.scene.to_yaml())
-    write_atomically(summary, to_json(summarize(run)))
-    return [solution, scene, summary]
+def save(solution: Solution, scene: Scene, summary: dict[str, Any], folder: Path) -> list[Path]:
+    """Write the files of a solve; those of an earlier one, figures too, do not stay beside them.
+
+    Args:
+        solution: The solution.
+        scene: The scene, of an episode with what was drawn.
+        summary: JSON values.
+        folder: Made if it is not there.
+
+    Returns:
+        The files.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / name for name in FILES]
+    if files[-1].exists():  # without it, figures are not of a solve
+        files[-1].unlink()
+        for name in (*FIGURES, CONVERGENCE):
+            for ending in ("png", "pdf"):
+                (folder / f"{name}.{ending}").unlink(missing_ok=True)
+    solution.save(files[0])
+    write_atomically(files[1], scene.to_yaml())
+    write_atomically(files[2], to_json(summary))
+    return files
 
 
 def _draw(run: ManeuverRun, folder: Path, formats: Sequence[str], readme_picture: Path | None) -> list[Path]:
@@ -92,7 +115,8 @@ def _draw(run: ManeuverRun, folder: Path, formats: Sequence[str], readme_picture
     from experts.figures.maneuver_curves import convergence_figure
 
     solve = run.solution, run.zero_control_cost, run.tolerance, run.solve_seconds
-    files = write_figures(run.maneuver, folder, formats, convergence=lambda: convergence_figure(*solve))
+    more = {CONVERGENCE: lambda: convergence_figure(*solve)}
+    files = write_figures(run.maneuver, folder, formats, **more)
     if readme_picture is not None:
         write_readme_picture(run.maneuver, readme_picture)
         files.append(readme_picture)

@@ -85,11 +85,25 @@ def test_figures_of_an_earlier_run_do_not_stay_beside_another_solution(
     scene_file: str, tmp_path: Path
 ) -> None:
     mine, old = tmp_path / "figure-3-of-my-thesis.png", tmp_path / "figure-3-pose-error.png"
-    for file in (mine, old):
+    for file in (mine, old, tmp_path / "summary.json"):
         file.write_bytes(b"")
     assert main(["solve", scene_file, "--solver", "box", "--out", str(tmp_path)]) == SUCCESS
     assert mine.exists()
     assert not old.exists()
+
+
+def test_a_solve_replaces_neither_its_scene_nor_its_start(
+    scene: Scene, solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = tmp_path / "scene.yaml"
+    mine.write_text(f"# my own words\n{scene.to_yaml()}")
+    start = tmp_path / "solution.npz"
+    start.write_bytes((solved / "solution.npz").read_bytes())
+    for arguments in ([mine], [solved / "scene.yaml", "--start", start]):
+        before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+        assert main(["solve", *map(str, arguments), "--solver", "box", "--out", str(tmp_path)]) == UNUSABLE
+        assert "is what is read, which it would replace" in capsys.readouterr().err
+        assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 def test_what_has_not_converged_is_saved_and_said(

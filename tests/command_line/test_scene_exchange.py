@@ -116,6 +116,14 @@ def test_light_dampers_that_whole_steps_follow_are_no_matter(
     assert "dampers" not in capsys.readouterr().out
 
 
+def test_a_page_of_others_is_not_replaced(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("arm.html").write_text("my own page")
+    words = ["scenes", "import", ARM, "--tip", "hand", *CARRIED, "--replay", "--out", "arm.yaml"]
+    assert main(words) == UNUSABLE
+    assert "arm.html exists: give another name, or --force" in capsys.readouterr().err
+    assert Path("arm.html").read_text() == "my own page"
+
+
 def test_torques_that_the_user_gives_stay(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = Path(ARM).read_text(encoding="utf-8").replace('effort="2"', 'effort="0"', 1)
     text = text.replace('effort="2"', 'effort="870"')

@@ -145,3 +145,12 @@ def test_help_of_the_terminal_itself_is_left_alone() -> None:
     console._force_terminal, console._color_system = True, None
     console.print(Text("red", "red"))
     assert "red" in console.file.getvalue()
+
+
+def test_pictures_of_others_stay_where_none_is_drawn(tmp_path: Path) -> None:
+    place, drawn = Destination(tmp_path, picture=False), {"errors.png": lambda: b"new"}
+    (tmp_path / "errors.png").write_bytes(b"mine")
+    place.write("flight", {}, drawn)
+    assert (tmp_path / "errors.png").read_bytes() == b"mine"
+    place.write("flight", {}, drawn)  # now it is taken for that of the first
+    assert not (tmp_path / "errors.png").exists()

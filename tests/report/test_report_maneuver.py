@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
-from dq_space_arm_env.algebra import dual_quaternion
+from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import StateLayout
 from experts.report import Maneuver, ManeuverRun, integrator_precision, replay, reproduction, run_maneuver
@@ -225,3 +225,14 @@ def test_delays_count_steps_so_finer_ones_show_no_error_of_the_integrator(short_
     assert "delays of actuators are whole steps" in console.export_text()
     with pytest.raises(ValueError, match="another step would be another robot"):
         integrator_precision.measure(delayed, QUICK, lambda *given: None)
+
+
+def test_a_missed_payload_goes_on_without_the_tip() -> None:
+    scene = load_scene("capture-and-detumble")
+    layout, steps = StateLayout.of(scene), scene.simulation.steps
+    still = Maneuver(scene, np.tile(layout.initial_state, (steps + 1, 1)), np.zeros((steps, layout.n_u)))
+    held, missed = still.payload, replace(still, caught=False).payload
+    assert held is not None
+    assert missed is not None
+    np.testing.assert_array_equal(held[-1], still.frames[-1, -1])
+    assert poses.error_distance(tuple(missed[-1]), tuple(still.frames[-1, -1])) > 0.1

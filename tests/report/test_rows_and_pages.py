@@ -13,7 +13,7 @@ from rich.console import Console
 
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.report_page import Figure, Page, Section
-from dq_space_arm_env.common.tables import Column, TextTable, tabulate
+from dq_space_arm_env.common.tables import Column, Row, TextTable, tabulate
 from experts.report.timing import three_digits
 
 PNG = b"\x89PNG made up"
@@ -172,6 +172,38 @@ def test_numbers_make_curves_and_text_makes_bars() -> None:
     assert len(plot.figure([]).axes) == 1  # where nothing is known there is nothing in it
     (axes,) = Plot("time_us", "method", color="motion", log="x").figure(ROWS).axes
     assert [bar.get_width() for bar in axes.patches] == [12, 2400, 3]
+
+
+def test_bars_stand_beside_their_names_in_every_panel() -> None:
+    pytest.importorskip("matplotlib")
+    from experts.figures.plots import Plot
+
+    lengths = {"step": {"a": 1.0, "b": 2.0, "c": 3.0}, "rate": {"c": 4.0}}
+    rows: list[Row] = [
+        {"quantity": quantity, "method": name, "largest": length}
+        for quantity, found in lengths.items()
+        for name, length in found.items()
+    ]
+    panels = Plot("largest", "method", facet="quantity").figure(rows).axes
+    names = [label.get_text() for label in panels[0].get_yticklabels()]  # of both
+    assert names == ["a", "b", "c"]
+    for axes in panels:
+        bars = {names[round(bar.get_y() + bar.get_height() / 2)]: bar.get_width() for bar in axes.patches}
+        assert bars == lengths[axes.get_title(loc="left")]
+
+
+@pytest.mark.parametrize("height", ["error", "method"])
+def test_names_are_no_mathematics_and_none_is_left_out(height: str) -> None:
+    pytest.importorskip("matplotlib")
+    from experts.figures.plots import Plot
+
+    names = ["gripper $5_a_b$", "a $x_{ b", "_mine"]
+    rows: list[Row] = [{"time_us": 1.0, "error": 1.0, "name": name, "method": f"{name}s"} for name in names]
+    plot = Plot("time_us", height, color="name", facet="name")
+    assert plot.png(rows).startswith(b"\x89PNG")
+    (legend,) = plot.figure(rows).legends
+    shown = [text.get_text().strip().replace(r"\$", "$") for text in legend.get_texts()]
+    assert shown == names
 
 
 def test_names_from_files_make_no_markup(origin: dict[str, Any]):

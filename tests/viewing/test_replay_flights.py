@@ -328,3 +328,13 @@ def test_flights_of_other_actuators_are_not_shown_together(paper, make_flight, n
     flights = [replace(make_flight(scene), scene=scene) for scene in (paper, other)]
     with pytest.raises(ValueError, match=f"other states or inputs \\('{name}'\\) than the scene"):
         common_scene(flights)
+
+
+def test_a_plan_is_no_success_where_what_it_catches_is_not_known():
+    wide = {"attitude_error_deg": 180.0, "position_error": 10.0}
+    scene = load_scene("capture-and-detumble")
+    scene = scene.replace(success={**wide, "angular_velocity_error_deg": None, "velocity_error": None})
+    layout, steps = StateLayout.of(scene), scene.simulation.steps
+    states, controls = np.tile(layout.initial_state, (steps + 1, 1)), np.zeros((steps, layout.n_u))
+    plan = Trajectory("plan", states, controls, scene=scene)
+    assert verdict(prepare([plan], scene)[0], scene).endswith("pose within the tolerances")

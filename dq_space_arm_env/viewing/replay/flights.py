@@ -283,7 +283,8 @@ def verdict(flight: ShownFlight, scene: Scene) -> str:
     within = angle <= scene.success.attitude_error_deg and distance <= scene.success.position_error
     reached = flight.is_success
     if reached is None:  # a plan, of which the pose is known
-        reached = within and not np.isfinite(scene.success.tolerances[2:]).any()
+        more = np.isfinite(scene.success.tolerances[2:]).any() or any(each.catch for each in scene.phases)
+        reached = within and not more
     short = "no success" if flight.is_success is False else "pose within the tolerances"
     end = "success" if reached else short if within else "outside the tolerances"
     return f"ends {place}: {end}{thin}"

@@ -32,6 +32,7 @@ from agents.policies import ExportedPolicy
 from agents.run_folder import validation_seeds
 from dq_space_arm_env import DQSpaceArmVectorEnv
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.common.tables import one_line
 from experts import GuidedDDP
 from experts.demonstrations import SerialExecutor
 from experts.problems.arm_problem import ArmProblem
@@ -271,7 +272,9 @@ def test_tables_have_all_columns_of_the_protocol(comparison):
     assert stub["success\n%"].startswith("0.0\n[0.0, 39.")
     text = markdown("Title", [first, second], comparison)
     for sentence in notes(comparison):
-        assert sentence in text
+        assert one_line(sentence) in text
+    named = markdown("Title", [], replace(comparison, scene="<img src=x> [a](javascript:b)"))
+    assert named.startswith("# Title, scene &lt;img src=x> [a]\\(javascript:b)")
     assert any("they do not know the new one" in sentence for sentence in notes(comparison))
     assert not any("other trainings" in sentence for sentence in notes(comparison))  # the stub has three
     entrants = [*CONTROLLERS.values(), "stub, seeds 0, 1, 2"]
