@@ -9,7 +9,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 COMMA := ,
-BENCHMARKS := work-precision scene-cost solvers throughput rendering
+BENCHMARKS := work-precision solvers scene-cost throughput rendering
 TEST := test$(if $(CI),$(COMMA)agents$(COMMA)jax$(COMMA)ray$(COMMA)search)
 
 .PHONY: paper docs test lint lock clean
@@ -24,7 +24,8 @@ docs: $(VENV)/installed-docs
 
 test: $(VENV)/installed-$(TEST) lint
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(if $(CI),-m "not endurance")
-	$(if $(CI),$(BIN)/python -m scripts.benchmarks --quick $(BENCHMARKS))
+	$(if $(CI),printf '%s\n' $(BENCHMARKS) | xargs -P 2 -I NAME \
+		$(BIN)/python -m scripts.benchmarks --quick --out results/benchmarks/NAME NAME)
 
 lint: $(VENV)/installed-$(TEST)
 	$(BIN)/ruff check .
