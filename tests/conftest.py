@@ -21,7 +21,6 @@ IN_CI = (
     "capture-and-detumble",
     "dual-arm",
     "elastic-joints",
-    "motors",
     "paper",
     "planar",
     "random-masses",

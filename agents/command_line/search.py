@@ -63,8 +63,8 @@ def search(
 
     SPACE has a mapping `search` of keys, such as algorithm.learning_rate, to {low: 0.001, high: 0.03, log:
     true} or {choices: [64, 128]}. Each trial is a training; it is judged by the last point of its learning
-    curve: more successes from validation starts win, and a tie goes to the lower cost. Optuna proposes trials
-    (TPE) and stops those that fall behind.
+    curve: more successes from validation starts win, less the flights that violate constraints, and a tie
+    goes to the lower cost. Optuna proposes trials (TPE) and stops those that fall behind.
 
     The output folder receives the run folder of each trial, the study, search.json, search.png, and
     best.yaml, a configuration for `train`. Re-run the command to resume; with more --trials it goes on.

@@ -91,7 +91,8 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
 
     ## Episode End
 
-    Nothing terminates an episode: the goal has to be reached and held, and success does not end it.
+    Nothing terminates an episode: the goal has to be reached and held, and success does not end it. Scenes with `other_tips`, or with a
+    constraint that has `terminates: true`, are refused.
 
     1. Truncation: the scene's number of steps (1000) is reached. In `DQSpaceArm-v0` that is the end of the task; here the time left is not observed and there is no
        terminal cost, so a step has the same value at any time, and algorithms should bootstrap.

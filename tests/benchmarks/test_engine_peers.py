@@ -116,7 +116,7 @@ def test_without_jax_devices_are_a_note(monkeypatch: pytest.MonkeyPatch) -> None
     assert "JAX is not installed (pip install jax" in row["note"]
 
 
-@pytest.mark.slow  # XLA compiles four functions
+@pytest.mark.endurance  # XLA compiles four functions
 def test_a_device_is_compared_with_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("jax")
     monkeypatch.setitem(devices.BATCHES, "cpu", (8,))

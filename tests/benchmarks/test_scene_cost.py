@@ -193,7 +193,7 @@ def test_nothing_optional_is_imported_and_casadi_only_to_compile(processes: list
     assert "casadi" not in used
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_a_solver_is_prepared_with_an_empty_and_with_a_full_cache() -> None:
     rows = list(preparation_rows(["planar"]))
     assert [(row["title"], row["cache"]) for row in rows] == [("planar", "empty"), ("planar", "warm")]

@@ -58,7 +58,7 @@ AT_REST = [name for name in list_scenes() if name not in NOT_THERE]
 
 
 @pytest.mark.sampled
-@pytest.mark.parametrize("solver", [BoxDDP, GuidedDDP])
+@pytest.mark.parametrize("solver", [BoxDDP, pytest.param(GuidedDDP, marks=pytest.mark.endurance)])
 @pytest.mark.parametrize("scene", AT_REST)
 def test_a_start_at_the_target_has_converged(scene, solver):
     """Cost and gradient are rounding errors there: nothing is left to do, and the result says so."""

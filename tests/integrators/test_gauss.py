@@ -92,7 +92,7 @@ def symplectic_form(kernels, x):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stiffness", [0.0, 100.0])
+@pytest.mark.parametrize("stiffness", [pytest.param(0.0, marks=pytest.mark.endurance), 100.0])
 def test_a_step_is_symplectic(stiffness):
     """A' form(x+) A = form(x), whatever the step; the methods beside it are off by their errors."""
     scene = sprung("free-floating", stiffness) if stiffness else simulated("free-floating")

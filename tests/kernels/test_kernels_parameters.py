@@ -131,7 +131,11 @@ def cases():
     for case in (*product(scenes, INTEGRATORS), *product((0, 1, 2), ("rk4", "symplectic_euler", "rodas4"))):
         if case[1] == "rodas5p" and case[0] != "planar+":
             continue  # it shares all but numbers with rodas4
-        late = pytest.mark.endurance if case in ((0, "rodas4"), (2, "rodas4")) else pytest.mark.slow
+        late = (
+            pytest.mark.endurance
+            if "random-target" in case or case in ((0, "rodas4"), (2, "rodas4"))
+            else pytest.mark.slow
+        )
         yield pytest.param(*case, marks=() if case in DEFAULT else late)
 
 

@@ -14,7 +14,10 @@ STEP = 5e-4
 CURVED = [name for name, entry in INTEGRATORS.items() if entry.curvature == name]
 SCENES = (*robots(), "random-target")  # whose target is a parameter of the cost
 # Each of the others takes seconds to compile.
-ODD_SCENES = [s if s in ("base", "wrist") else pytest.param(s, marks=pytest.mark.slow) for s in ODD]
+LATE = [pytest.mark.slow] * 6 + [pytest.mark.endurance] * len(ODD)
+ODD_SCENES = [
+    s if s in ("base", "wrist") else pytest.param(s, marks=late) for s, late in zip(ODD, LATE, strict=False)
+]
 
 
 def right_jacobian(kernels, twist):

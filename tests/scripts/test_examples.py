@@ -200,7 +200,9 @@ def test_lesson() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["debris-capture", "docking", "space-robot-reach"])
+@pytest.mark.parametrize(
+    "name", ["debris-capture", "docking", pytest.param("space-robot-reach", marks=pytest.mark.endurance)]
+)
 def test_the_expert_solves_the_tasks_of_peers(name: str) -> None:
     scene = load_scene(Path(f"scripts/examples/{name}.yaml"))
     assert scene.name == name

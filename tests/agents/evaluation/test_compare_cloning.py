@@ -67,7 +67,7 @@ def test_it_measures_draws_and_goes_on(arguments, tmp_path, capsys):
     assert (tmp_path / LINES).read_text().splitlines() == again
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_each_seed_draws_its_own_demonstrations(arguments, tmp_path):
     own = [*arguments[:2], *arguments[4:-1], "2", "--counts", "3", "--out", str(tmp_path), "--no-picture"]
     assert main(["compare", "cloning", *own]) == 0

@@ -22,7 +22,7 @@ CONSTRAINED = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_ipopt_finds_nothing_better_near_the_experts_plan():
     problem = ArmProblem("paper")
     solution = BoxDDP(problem).solve()

@@ -232,7 +232,7 @@ SERVICER = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_the_mirrored_model_reaches_what_the_hybrid_creeps_to():
     """Light hand, four joints: the cheapest maneuver ends 14 degrees off, where Gauss-Newton creeps."""
     hybrid = GuidedDDP(SERVICER, second_order="hybrid", coarsening=5)
