@@ -252,7 +252,7 @@ def test_a_solution_flies_in_its_scene_where_phases_change_and_episodes_draw_num
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stiffness", [0.0, 2e4])
+@pytest.mark.parametrize("stiffness", [pytest.param(0.0, marks=pytest.mark.endurance), 2e4])
 def test_catches_are_judged_as_environments_judge_them(stiffness: float) -> None:
     """Each error a little within its tolerance, then beyond it, of a target that tumbles.
 

@@ -142,7 +142,7 @@ def test_unusable_input_is_refused(changes, sentence: str, quick_scene: Scene, t
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_idle_thrusters_are_at_a_limit(tmp_path: Path):
     scene = load_scene("thrusters").replace(simulation={"dt": 0.15, "steps": 100})
     (made,) = generate_demonstrations(scene, 1, tmp_path / "jets", executor=SerialExecutor())

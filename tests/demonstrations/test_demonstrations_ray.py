@@ -161,7 +161,7 @@ def test_a_machine_killed_under_way_changes_no_byte(
 
 
 @pytest.mark.ray
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_shards_lost_with_the_machine_that_has_made_them_are_made_again(
     cluster: LocalCluster,
     whole: Demonstrations,

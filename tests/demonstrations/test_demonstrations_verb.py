@@ -108,13 +108,9 @@ def shards(out: Path) -> int:
     return len([path for path in (out / "shards").glob("*") if not path.name.startswith(".")])
 
 
+@pytest.mark.endurance
 @pytest.mark.parametrize(
-    ("workers", "spread"),
-    [
-        pytest.param(1, {}, marks=pytest.mark.slow),
-        pytest.param(2, {}, marks=pytest.mark.endurance),
-        pytest.param(2, {"target_position": 0.15, "base_mass": 0.1}, marks=pytest.mark.endurance),
-    ],
+    ("workers", "spread"), [(1, {}), (2, {}), (2, {"target_position": 0.15, "base_mass": 0.1})]
 )
 def test_killed_at_random_moments_it_ends_with_the_same_bytes(
     scene_file: str, workers: int, spread: dict[str, float], tmp_path: Path

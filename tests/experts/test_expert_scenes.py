@@ -182,7 +182,7 @@ def test_symplectic_euler_at_15_ms_is_off_by_degrees():
     assert info["attitude_error"] > 3.0
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_the_papers_54_state_formulation_reaches_the_same_maneuver(paper_solution):
     problem = PaperProblem()
     solution = BoxDDP(problem).solve()

@@ -45,7 +45,7 @@ def test_a_window_has_the_bounds_of_its_stages():
     np.testing.assert_array_equal(lower, maneuver.control_lower)
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_it_flies_through_a_phase_without_actuators():
     expert, actions = RecedingHorizonExpert("release"), []
 
@@ -109,7 +109,7 @@ def test_undisturbed_it_costs_no_more_than_the_full_horizon(scene, plans, expert
     assert experts[scene].fallbacks == 0
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_noise_on_the_state_hardly_costs_anything(plans, experts):
     """Noise of 0.01 rad, m, rad/s, m/s; controls that answer noise cost effort, so a little is lost."""
     cost, angle, distance = fly(compile_scene("paper"), closed_loop(experts["paper"]), noise=0.01)

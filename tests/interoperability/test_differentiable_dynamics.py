@@ -351,7 +351,7 @@ def test_gradients_by_xla_are_those_of_the_kernels(name, integrator, jax, scene_
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10 * scale)
 
 
-@pytest.mark.parametrize("kernels", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("kernels", [pytest.param(False, marks=pytest.mark.endurance), True])
 def test_rollouts_in_jax_are_those_in_torch(kernels, jax, torch, short_scene):
     _, states, inputs, _ = moving(short_scene)
     dynamics = jax_dynamics(short_scene, "symplectic_euler", kernels=kernels)

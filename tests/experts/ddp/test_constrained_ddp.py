@@ -224,9 +224,7 @@ def test_multipliers_of_another_problem_are_refused():
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            name, marks=pytest.mark.slow if name in ("joint-limits", "plume") else pytest.mark.endurance
-        )
+        pytest.param(name, marks=pytest.mark.slow if name == "joint-limits" else pytest.mark.endurance)
         for name in CONSTRAINED
     ],
 )
