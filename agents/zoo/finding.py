@@ -26,6 +26,7 @@ from agents.zoo.normalization import ObservationStatistics, StatisticsError, rea
 from agents.zoo.onnx_model import OnnxModel, OnnxModelError
 from agents.zoo.shelf import ZooError, policy_file
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+from dq_space_arm_env.environment.goal_rewards import show_goals
 from dq_space_arm_env.environment.rollouts import StateFeedback
 from dq_space_arm_env.scene import StateLayout, list_scenes
 from dq_space_arm_env.task.step_report import n_observations
@@ -260,13 +261,8 @@ def _on_goals(
 
     def act_on_states(states: NDArray[np.float64], step: int) -> NDArray[Any]:
         (environment,) = flown_in
-        layout = environment.kernels.layout
-        parts = {
-            "achieved_goal": np.reshape(environment.kernels.tip_pose(states), (len(states), 8)),
-            "desired_goal": environment.targets,
-            "observation": layout.goal_observation(states, environment.stage_parameters),
-        }
-        single = {name: np.asarray(part, dtype=np.float32) for name, part in parts.items()}
+        parts = show_goals(environment.kernels, states, environment.stage_parameters)
+        single = {name: parts[name].astype(np.float32) for name in sorted(parts)}  # as their space has them
         return act(np.concatenate(list(single.values()), axis=1) if joined else single)
 
     return StateFeedback(act_on_states, begin)
