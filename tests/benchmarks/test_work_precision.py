@@ -332,7 +332,7 @@ def test_the_whole_system_20_and_its_schur_complement_give_the_accelerations(sce
     np.testing.assert_allclose([float(entry) for entry in whole], expected, rtol=1e-11, atol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.endurance  # the quick benchmark, which CI runs, judges the same
 def test_formulations_agree_within_their_precision() -> None:
     rows = list(measure_formulations(SHORT))
     assert shortcomings(rows) == []

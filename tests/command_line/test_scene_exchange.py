@@ -474,7 +474,12 @@ def test_links_and_joints_are_completed() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("package", "path", "tip"),
-    [("", ARM, "hand"), ("airo-models", "airo_models/arms/ur3e/ur3e.urdf", "tool0")],
+    [
+        ("", ARM, "hand"),
+        pytest.param(
+            *("airo-models", "airo_models/arms/ur3e/ur3e.urdf", "tool0"), marks=pytest.mark.endurance
+        ),
+    ],
 )
 def test_the_maneuver_to_begin_with_is_solved_and_flown(
     package: str, path: str, tip: str, here: Path, capsys: pytest.CaptureFixture[str]

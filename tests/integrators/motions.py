@@ -32,15 +32,9 @@ def free_body(*actuators, **changes):
     return compile_scene(load_scene("paper").replace(actuators=Actuators(**limits), **bare, **changes))
 
 
-def rollout(kernels, x, controls, dt, integrator):
-    """States along a sequence of inputs: the scalar kernel walks down rows that it has just written."""
-    steps = len(controls)
-    states = np.empty((steps + 1, kernels.n_x))
-    states[0], h = x, np.array([dt])
-    arrays = (states, np.ascontiguousarray(controls), h, states[1:])
-    buffers = np.array([array.ctypes.data for array in arrays], dtype=np.int64)
-    kernels.kernel("step", integrator=integrator, lanes=1).native.function(0, steps, buffers.ctypes.data)
-    return states
+def rollout(kernels, x, controls, dt, integrator, p=None):
+    """States along a sequence of inputs."""
+    return kernels.simulate(x, controls, len(controls), dt, integrator, p=p)
 
 
 def moving_start(kernels, seed=0, joint_rate=0.4, base_rate=0.15):
@@ -51,13 +45,13 @@ def moving_start(kernels, seed=0, joint_rate=0.4, base_rate=0.15):
     return x
 
 
-def exact_motion(kernels, x, u, end, method="DOP853", tolerance=1e-13):
+def exact_motion(kernels, x, u, end, method="DOP853", tolerance=1e-13, p=None):
     """End of a motion by SciPy, on the vector field of (8) and (22)."""
     layout, wrist = kernels.layout.state, u[kernels.layout.control.wrist_rate]
 
     def field(_, state):
         pose_rate = dq.derivative(tuple(state[layout.pose]), tuple(state[layout.base_velocity]))
-        accelerations = kernels.forward_dynamics(state, u)
+        accelerations = kernels.forward_dynamics(state, u, p=p)
         return np.concatenate([pose_rate, state[layout.joint_rates], wrist, accelerations])
 
     return solve_ivp(field, (0.0, end), x, method=method, rtol=tolerance, atol=tolerance).y[:, -1]

@@ -26,6 +26,20 @@ def still(kernels, steps=STEPS):
     return np.zeros((steps, kernels.n_u))
 
 
+@cache
+def variable(name, **simulation):
+    """Kernels of a scene whose springs and dampers are parameters: compiled once for all of them."""
+    scene = sprung(name, 1.0, 1.0, **simulation)
+    parts = [f"links.{j}.{part}" for j in range(len(scene.links)) for part in ("stiffness", "damping")]
+    return compile_scene(scene.replace(parameters=parts))
+
+
+def springs(kernels, stiffness, damping=0.0):
+    """Parameters of `variable`, for all joints alike or one by one."""
+    joints = np.zeros(kernels.n_p // 2)
+    return np.stack([stiffness + joints, damping + joints], axis=1).ravel()
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_tableaus_are_consistent_and_l_stable(name):
     """On y' = a y a step multiplies by R(h a): |R| <= 1 in the left half plane, 0 at infinity."""
@@ -53,15 +67,15 @@ def test_tableaus_are_consistent_and_l_stable(name):
 )
 @pytest.mark.parametrize("name", NAMES)
 def test_errors_against_dop853_fall_with_the_order_of_the_method(name, scene, stiffness):
-    undivided = {"integrator": name, "tolerance": 1e3}
-    kernels = compile_scene(sprung(scene, stiffness, 0.05 * stiffness, **undivided))
+    kernels = variable(scene, integrator=name, tolerance=1e3)  # steps are not divided
+    p = springs(kernels, stiffness, 0.05 * stiffness)
     x = moving_start(kernels, joint_rate=0.8, base_rate=0.4)
     u = np.random.default_rng(1).uniform(-0.3, 0.3, kernels.n_u)
-    exact = exact_motion(kernels, x, u, 1.2)
+    exact = exact_motion(kernels, x, u, 1.2, p=p)
     counts = {"rodas4": (32, 64, 128), "rodas5p": (16, 32, 64)}[name]
     errors = []
     for steps in counts:
-        final = rollout(kernels, x, np.tile(u, (steps, 1)), 1.2 / steps, name)[-1]
+        final = rollout(kernels, x, np.tile(u, (steps, 1)), 1.2 / steps, name, p)[-1]
         errors.append(np.linalg.norm(kernels.difference(exact, final)))
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
     assert orders == pytest.approx(TABLEAUS[name].order, abs=0.3)
@@ -74,11 +88,12 @@ def test_errors_against_dop853_fall_with_the_order_of_the_method(name, scene, st
 )
 def test_stiff_damped_joints_agree_with_radau(name, stiffness, damping, bound):
     """Steps of 15 ms, while rk4 needs some of 1 ms and less to be stable."""
-    kernels = compile_scene(sprung(stiffness=stiffness, damping=damping))
+    kernels = variable("paper")
+    p = springs(kernels, stiffness, damping)
     x = moving_start(kernels, joint_rate=0.0, base_rate=0.1)
     u = np.random.default_rng(1).uniform(-0.5, 0.5, kernels.n_u)
-    exact = exact_motion(kernels, x, u, 0.6, "Radau", 1e-11)
-    final = rollout(kernels, x, np.tile(u, (40, 1)), DT, name)[-1]
+    exact = exact_motion(kernels, x, u, 0.6, "Radau", 1e-11, p)
+    final = rollout(kernels, x, np.tile(u, (40, 1)), DT, name, p)[-1]
     assert np.linalg.norm(kernels.difference(exact, final)) < bound
 
 
@@ -87,10 +102,10 @@ def test_stiff_damped_joints_agree_with_radau(name, stiffness, damping, bound):
 @pytest.mark.parametrize("scene", ["paper", "planar"])
 @pytest.mark.parametrize("stiffness", [1e2, 1e4, 1e6, 1e8])
 def test_stiff_springs_never_gain_energy_where_rk4_explodes(stiffness, scene, name):
-    kernels = compile_scene(sprung(scene, stiffness))
-    x = moving_start(kernels)
-    states = rollout(kernels, x, still(kernels), DT, name)
-    energy = kernels.energy(states)
+    kernels = variable(scene)
+    x, p = moving_start(kernels), springs(kernels, stiffness)
+    states = rollout(kernels, x, still(kernels), DT, name, p)
+    energy = kernels.energy(states, p=p)
     assert np.isfinite(states).all()
     assert energy.max() <= energy[0] * (1.0 + 1e-7)
     assert energy[-1] > 0.85 * energy[0]  # the base's motion stays; only vibrations may be damped
@@ -98,19 +113,17 @@ def test_stiff_springs_never_gain_energy_where_rk4_explodes(stiffness, scene, na
     assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.linalg.norm(momentum[0])
     if stiffness >= 1e6:
         with np.errstate(all="ignore"):
-            exploded = kernels.energy(rollout(kernels, x, still(kernels, 1000), DT, "rk4"))
+            exploded = kernels.energy(rollout(kernels, x, still(kernels, 1000), DT, "rk4", p), p=p)
         assert not exploded[-1] < 10.0 * energy[0]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MOVED)
 def test_soft_and_stiff_joints_get_along(name):
-    scene = sprung()
-    stiffness = (1e2, 1e5, 1e8)
-    links = [link.model_dump() | {"stiffness": k} for link, k in zip(scene.links, stiffness, strict=True)]
-    kernels = compile_scene(scene.replace(links=links))
-    states = rollout(kernels, moving_start(kernels), still(kernels), DT, name)
-    energy = kernels.energy(states)
+    kernels = variable("paper")
+    p = springs(kernels, (1e2, 1e5, 1e8))
+    states = rollout(kernels, moving_start(kernels), still(kernels), DT, name, p)
+    energy = kernels.energy(states, p=p)
     assert energy.max() <= energy[0] * (1.0 + 1e-9)
     # The soft joint still swings, the others are held.
     angles = states[-1000:, kernels.layout.state.joint_angles]
@@ -122,11 +135,11 @@ def test_soft_and_stiff_joints_get_along(name):
 @pytest.mark.parametrize("name", MOVED)
 @pytest.mark.parametrize("stiffness", [0.0, 1e6])
 def test_dampers_of_a_million_stop_the_joints_and_nothing_else(stiffness, name):
-    kernels = compile_scene(sprung(stiffness=stiffness, damping=1e6))
-    x = moving_start(kernels)
-    states = rollout(kernels, x, still(kernels), DT, name)
+    kernels = variable("paper")
+    x, p = moving_start(kernels), springs(kernels, stiffness, 1e6)
+    states = rollout(kernels, x, still(kernels), DT, name, p)
     assert np.abs(states[-1, kernels.layout.state.joint_rates]).max() < 1e-6
-    energy = kernels.energy(states)
+    energy = kernels.energy(states, p=p)
     assert energy.max() <= energy[0] * (1.0 + 1e-9)
     momentum = kernels.momentum(states)
     assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.linalg.norm(momentum[0])
@@ -137,10 +150,9 @@ def test_dampers_of_a_million_stop_the_joints_and_nothing_else(stiffness, name):
 def test_infinite_stiffness_is_a_locked_arm(name):
     """The base then moves as a rigid body with the arm's mass does: Euler's equations about its center."""
     end, errors = 3.0, []
+    kernels = variable("free-floating", integrator=name, tolerance=1e-9)
     for stiffness in (3e2, 3e4, 3e6):
-        damping = 2.0 * stiffness**0.5
-        scene = sprung("free-floating", stiffness, damping, integrator=name, tolerance=1e-9)
-        kernels = compile_scene(scene)
+        p = springs(kernels, stiffness, 2.0 * stiffness**0.5)
         layout, x = kernels.layout.state, kernels.layout.initial_state.copy()
         x[layout.pose] = np.eye(8)[0]
         twists = np.tile(x, (3, 1))
@@ -152,7 +164,7 @@ def test_infinite_stiffness_is_a_locked_arm(name):
             return np.linalg.solve(inertia, np.cross(inertia @ omega, omega))
 
         exact = solve_ivp(euler, (0.0, end), [0.3, -0.2, 0.4], "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-        final = rollout(kernels, x, still(kernels, 200), DT, name)[-1]
+        final = rollout(kernels, x, still(kernels, 200), DT, name, p)[-1]
         errors.append(np.linalg.norm(final[layout.base_velocity][:3] - exact))
     assert errors[2] < 1e-7
     # The arm bends by torque / stiffness.
@@ -264,14 +276,6 @@ def checked(kernels, x, u, name, p=None, steps=20):
     return x, np.max(errors)
 
 
-@cache
-def variable(name):
-    """Kernels of a scene whose springs and dampers are parameters: compiled once for all cells."""
-    scene = sprung(name, 1.0, 1.0)
-    parts = [f"links.{j}.{part}" for j in range(len(scene.links)) for part in ("stiffness", "damping")]
-    return compile_scene(scene.replace(parameters=parts))
-
-
 CELLS = [  # stiffness, damping, deflection, rate, joints
     (1e4, 0.0, 0.1, 0.0, (1,)),
     (1e4, 0.0, 0.3, 0.0, (0, 1, 2)),
@@ -299,9 +303,8 @@ def test_steps_of_15_ms_are_right_at_finite_deflections(
     """Before, in velocities, both methods blew up in five of these cells."""
     kernels = variable(scene)
     x, u = off_rest(kernels, deflection, rate, joints), np.full(kernels.n_u, 0.02)
-    p = np.array(
-        [[stiffness, damping] if j in joints else [0.0, 0.0] for j in range(kernels.n_p // 2)]
-    ).ravel()
+    is_sprung = np.isin(np.arange(kernels.n_p // 2), joints)
+    p = springs(kernels, stiffness * is_sprung, damping * is_sprung)
     end, error = checked(kernels, x, u, name, p)
     finest = 4000 if scene == "free-floating" else 16000  # lighter links swing faster
     count = finest * int(np.sqrt(1.0 + stiffness / 1e4 + damping / 1e1))
@@ -321,11 +324,10 @@ def test_steps_of_15_ms_are_right_at_finite_deflections(
 @pytest.mark.parametrize("rate", [0.1, 1.0])
 def test_a_moving_joint_that_meets_a_damper_stops_plastically(rate, damping, name):
     """The damper takes what a lock at that angle would: momentum stays, relative motion goes."""
-    precise = {"integrator": name, "tolerance": 1e-10}
-    kernels = compile_scene(sprung("free-floating", 0.0, damping, (1,), **precise))
-    x = off_rest(kernels, rate=rate)
+    kernels = variable("free-floating", integrator=name, tolerance=1e-10)
+    x, p = off_rest(kernels, rate=rate), springs(kernels, 0.0, np.array([0.0, damping, 0.0]))
     dt = 1e-4  # a thousand time constants, while the rest hardly moves
-    end, error = kernels.checked_step(x, np.zeros(kernels.n_u), dt, name)
+    end, error = kernels.checked_step(x, np.zeros(kernels.n_u), dt, name, p=p)
     where = kernels.layout.state
     assert error <= 1.0
     assert abs(end[where.joint_rates][1]) < 1e-6 + 10.0 / damping

@@ -70,8 +70,8 @@ def scenes_and_integrators():
         spherical = any(link.is_spherical for link in load_scene(scene).links)
         if spherical and not INTEGRATORS[integrator].turns_quaternions:
             continue
-        if integrator == "rodas5p" and scene != "planar":
-            continue  # it shares all but numbers with rodas4
+        if integrator in ("rodas5p", "rk8") and scene != "planar":
+            continue  # they share all but numbers with rodas4 and rk6
         if integrator == "rk4" or scene in STRUCTURES or INTEGRATORS[integrator].curvature == integrator:
             yield scene, integrator
 

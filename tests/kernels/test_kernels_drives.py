@@ -40,7 +40,9 @@ def with_stiffness(stiffness, **others):
         "rk4",
         "gauss6",
         *(
-            pytest.param(name, marks=pytest.mark.slow)
+            pytest.param(
+                name, marks=pytest.mark.endurance if name in ("rodas5p", "rk8") else pytest.mark.slow
+            )
             for name in INTEGRATORS
             if name not in ("rk4", "gauss6")
         ),

@@ -41,7 +41,7 @@ def test_accelerations_and_reactions_agree_to_1e_12(name, draw):
 
 @pytest.mark.sampled
 @pytest.mark.parametrize(
-    "name", [s if s in DIFFERENTIATED else pytest.param(s, marks=pytest.mark.slow) for s in robots()]
+    "name", [s if s in DIFFERENTIATED else pytest.param(s, marks=pytest.mark.endurance) for s in robots()]
 )
 def test_derivatives_of_a_step_agree_to_1e_12(name, draw):
     kernels, states, inputs = both(draw, load_scene(name), 3)

@@ -61,6 +61,7 @@ def odd_scenes_and_integrators():
     for name in ("base", "wrist", "one link", "wheels and jets", "no actuator", "wrist without motor"):
         for integrator in INTEGRATORS:
             is_slow = INTEGRATORS[integrator].curvature != integrator and name != "one link"
+            is_slow |= integrator in ("rodas5p", "rk8")
             yield pytest.param(name, integrator, marks=[pytest.mark.endurance] if is_slow else [])
 
 

@@ -129,13 +129,10 @@ def cases():
     """Every method with each kind of parameters; by default, one method of each kind."""
     scenes = ("random-masses", "random-target", "paper+", "planar+")
     for case in (*product(scenes, INTEGRATORS), *product((0, 1, 2), ("rk4", "symplectic_euler", "rodas4"))):
-        if case[1] == "rodas5p" and case[0] != "planar+":
-            continue  # it shares all but numbers with rodas4
-        late = (
-            pytest.mark.endurance
-            if "random-target" in case or case in ((0, "rodas4"), (2, "rodas4"))
-            else pytest.mark.slow
-        )
+        if case[1] in ("rodas5p", "rk8") and case[0] != "planar+":
+            continue  # they share all but numbers with rodas4 and rk6
+        is_shown = case[0] in ("random-masses", "random-target") or case in ((0, "rodas4"), (2, "rodas4"))
+        late = pytest.mark.endurance if is_shown else pytest.mark.slow
         yield pytest.param(*case, marks=() if case in DEFAULT else late)
 
 

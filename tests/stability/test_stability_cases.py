@@ -19,12 +19,15 @@ def is_recorded(case: Case) -> bool:
 
 LONG = ("energy", "base to arm mass 1e-12 to 1e12", "damper of 1e+06")
 """Cases that take CI longest, of motions that others show too, begin so."""
+ALIKE = ("rodas5p", "rk6")
+"""They share all but numbers with rodas4 and rk8."""
 
 
 def marks(case: Case) -> tuple[pytest.MarkDecorator, ...]:
     """A motion of a million steps of which nothing is claimed fails only if it cannot be had at all."""
     is_idle = case.group == long_motions.GROUP and not is_recorded(case)
-    return (pytest.mark.endurance,) if is_idle or case.title.startswith(LONG) else ()
+    is_late = is_idle or case.title.startswith(LONG) or case.subject.startswith(ALIKE)
+    return (pytest.mark.endurance,) if is_late else ()
 
 
 CASES = [pytest.param(case, id=f"{case.group}: {case.title}", marks=marks(case)) for case in all_cases()]

@@ -51,12 +51,14 @@ def cases() -> Iterator[Case]:
 
 
 @cache
-def _arm(stiffness: float, damping: float) -> Kernels:
+def _arm() -> Kernels:
+    """Kernels of which stiffness and damping of the joint are the parameters."""
     scene = load_scene("free-floating")
     links = [link.model_dump() for link in scene.links]
     rest = scene.initial_state.joint_angles[JOINT]
-    links[JOINT] |= {"stiffness": stiffness, "damping": damping, "rest_angle": rest}
-    return compile_scene(scene.replace(name="stiff joint", links=links))
+    links[JOINT] |= {"stiffness": 1.0, "damping": 1.0, "rest_angle": rest}
+    parameters = [f"links.{JOINT}.stiffness", f"links.{JOINT}.damping"]
+    return compile_scene(scene.replace(name="stiff joint", links=links, parameters=parameters))
 
 
 def _start(kernels: Kernels, deflection: float, rate: float) -> FloatArray:
@@ -73,12 +75,12 @@ def _reference(stiffness: float, damping: float, deflection: float, rate: float)
 
     None for a motion so violent that steps of two thirds end elsewhere.
     """
-    kernels, duration = _arm(stiffness, damping), STEPS * TIME_STEP
+    kernels, duration, p = _arm(), STEPS * TIME_STEP, np.array([stiffness, damping])
     fastest = float(np.sqrt(stiffness / _LEAST_INERTIA)) + damping / _LEAST_INERTIA
     count = max(2000, int(2.0 * duration * fastest))
     x, still = _start(kernels, deflection, rate), np.zeros(kernels.n_u)
     ends = [
-        kernels.simulate(x, still, steps, duration / steps, "rk8", every=steps)[-1]
+        kernels.simulate(x, still, steps, duration / steps, "rk8", every=steps, p=p)[-1]
         for steps in (count, 3 * count // 2)
     ]
     moved = _moved(kernels, *ends)
@@ -100,12 +102,13 @@ def _cells(
     effort: Effort,
 ) -> Outcome:
     """Judge all deflections, or rates, of one spring or damper."""
-    kernels, curve, told, violent = _arm(stiffness, damping), [], [], []
+    kernels, p = _arm(), np.array([stiffness, damping])
+    curve, told, violent = [], [], []
     for size in deflections if len(deflections) > 1 else rates:
         deflection, rate = (size, 0.0) if len(deflections) > 1 else (0.0, size)
         x, worst = _start(kernels, deflection, rate), 0.0
         for _ in range(STEPS):
-            x, error = kernels.checked_step(x, np.zeros(kernels.n_u), TIME_STEP, integrator)
+            x, error = kernels.checked_step(x, np.zeros(kernels.n_u), TIME_STEP, integrator, p=p)
             worst = max(worst, float(error) if error <= 1.0 else np.inf)
         if worst > 1.0:
             told.append(f"{size:g}")

@@ -112,9 +112,14 @@ def random_state(kernels: Kernels, rng: np.random.Generator) -> FloatArray:
 
 
 def walk(
-    kernels: Kernels, state: FloatArray, controls: FloatArray, dt: float, integrator: str | None = None
+    kernels: Kernels,
+    state: FloatArray,
+    controls: FloatArray,
+    dt: float,
+    integrator: str | None = None,
+    p: FloatArray | None = None,
 ) -> FloatArray:
     """States along inputs, shape (n, n_u): shape (n + 1, n_x), in the scene's precision."""
     if not len(controls):
         return np.asarray(state, kernels.dtype)[None]
-    return kernels.simulate(state, controls, len(controls), dt, integrator)
+    return kernels.simulate(state, controls, len(controls), dt, integrator, p=p)

@@ -93,9 +93,11 @@ def _product_in_words(limit: float) -> str:
 
 
 @cache
-def _sprung(stiffness: float, damping: float, precision: str = "float64") -> tuple[Kernels, float]:
-    """Kernels of a sprung joint, and the inertia that it turns."""
-    scene = sprung_joint(stiffness, damping).replace(simulation={"precision": precision})
+def _sprung(precision: str = "float64") -> tuple[Kernels, float]:
+    """Kernels of a sprung joint, stiffness and damping its parameters, and the inertia that it turns."""
+    scene = sprung_joint(1.0, 1.0).replace(
+        simulation={"precision": precision}, parameters=["links.0.stiffness", "links.0.damping"]
+    )
     return compile_scene(scene), sprung_inertia(scene)
 
 
@@ -108,18 +110,18 @@ class Energy(NamedTuple):
 
 def _frequency(stiffness: float) -> float:
     """Angular frequency of the sprung joint, rad/s."""
-    return float(np.sqrt(stiffness / _sprung(stiffness, 0.0)[1]))
+    return float(np.sqrt(stiffness / _sprung()[1]))
 
 
 def swing(integrator: str, stiffness: float, product: float, precision: str = "float64") -> Energy:
     """Let a joint swing."""
-    kernels, exact = _sprung(stiffness, 0.0, precision)[0], _sprung(stiffness, 0.0)[0]
+    kernels, exact, p = _sprung(precision)[0], _sprung()[0], np.array([stiffness, 0.0])
     x = kernels.layout.initial_state.copy()
     x[kernels.layout.state.joint_angles] = DEFLECTION
     dt = product / _frequency(stiffness)
-    states = walk(kernels, x, np.zeros((STEPS, kernels.n_u)), dt, integrator)
+    states = walk(kernels, x, np.zeros((STEPS, kernels.n_u)), dt, integrator, p)
     with np.errstate(all="ignore"):
-        energies = np.asarray(exact.energy(states)) / exact.energy(x)
+        energies = np.asarray(exact.energy(states, p=p)) / exact.energy(x, p=p)
         change = float(np.abs(energies - 1.0).max())
         if not change < LARGEST_CHANGE:
             return Energy(np.inf, LARGEST_CHANGE)
@@ -129,10 +131,11 @@ def swing(integrator: str, stiffness: float, product: float, precision: str = "f
 
 def rate_left(integrator: str, damping: float, product: float, precision: str = "float64") -> float:
     """Let a joint come to rest in its damper."""
-    kernels, inertia = _sprung(0.0, damping, precision)
+    kernels, inertia = _sprung(precision)
     x = kernels.layout.initial_state.copy()
     x[kernels.layout.state.joint_rates] = RATE
-    final = walk(kernels, x, np.zeros((STEPS, kernels.n_u)), product * inertia / damping, integrator)[-1]
+    dt, p = product * inertia / damping, np.array([0.0, damping])
+    final = walk(kernels, x, np.zeros((STEPS, kernels.n_u)), dt, integrator, p)[-1]
     left = abs(float(final[kernels.layout.state.joint_rates][0])) / RATE
     return left if np.isfinite(left) else np.inf
 
@@ -159,7 +162,7 @@ def _springs_at_15_ms(integrator: str, effort: Effort) -> Outcome:
 
 
 def _dampers_at_15_ms(integrator: str, effort: Effort) -> Outcome:
-    products = [TIME_STEP * damping / _sprung(0.0, damping)[1] for damping in DAMPINGS]
+    products = [TIME_STEP * damping / _sprung()[1] for damping in DAMPINGS]
     found = [rate_left(integrator, d, p) for d, p in zip(DAMPINGS, products, strict=True)]
     entry = INTEGRATORS[integrator]
     # A symplectic method is bounded beyond, but comes to rest slowly.
