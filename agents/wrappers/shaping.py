@@ -138,7 +138,13 @@ class Shaping(NamedTuple):
             )
         return cls(scale, power, success_reward, end_error_cost, tolerances)
 
-    def of_steps(self, rewards: ArrayLike, steps: int | NDArray[np.int64]) -> NDArray[np.float32]:
+    def steps_left(self, env: Any) -> NDArray[np.float64] | None:
+        """Time steps that the episodes of an environment still have; None where nothing depends on them."""
+        if self.power == 1.0 or not isinstance(scene := getattr(env, "scene", None), Scene):
+            return None
+        return np.asarray(scene.simulation.steps - env.get_state()["memory"][..., 0], dtype=np.float64)
+
+    def of_steps(self, rewards: ArrayLike, steps: ArrayLike) -> NDArray[np.float32]:
         """Power and scale of rewards, shape (B,), of so many time steps each."""
         values = np.asarray(rewards)
         if self.power != 1.0:

@@ -121,7 +121,8 @@ class ShapeReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     The reward r of a decision of n time steps, those that the `RepeatAction` inside has taken, becomes
     s n sign(r) |r / n|^p, with the scale s and the power p: with 1/2 the quadratic cost grows like the error,
-    so that the last centimeters, a thousandth of a maneuver's cost, are worth the effort. Terms at the end of
+    so that the last centimeters, a thousandth of a maneuver's cost, are worth the effort. Where an episode
+    ends early, which the environment charges for all remaining steps, n counts these too. Terms at the end of
     an episode are not scaled: `success_reward` pays for success; `end_error_cost` charges the final errors
     beyond what the scene does, whose optimum ends just outside the tolerances for some starts. It is
     c e / (1 + e), where e adds up the squares of the final errors over the tolerances. Rewards are rounded to
@@ -168,9 +169,13 @@ class ShapeReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def step(self, action: Any) -> Result:
         """Take a step whose reward is shaped, see `gymnasium.Env.step`."""
+        left = self._shaping.steps_left(self.env.unwrapped)
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.unshaped = float(reward)
-        shaped = self._shaping.of_steps([self.unshaped], _steps_taken(self.env)[0])
+        steps: Any = _steps_taken(self.env)[0]
+        if left is not None and (terminated or info.get("diverged", False)):
+            steps = left
+        shaped = self._shaping.of_steps([self.unshaped], steps)
         if (terminated or truncated) and self._shaping.counts_ends:
             shaped += self._shaping.of_ends(info)
         return observation, float(shaped[0]), terminated, truncated, info

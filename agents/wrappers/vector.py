@@ -265,9 +265,13 @@ class ShapeReward(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def step(self, actions: Any) -> Result:
         """Take a step whose rewards are shaped, see `gymnasium.vector.VectorEnv.step`."""
+        left = self._shaping.steps_left(self.env.unwrapped)
         observations, self.unshaped, terminated, truncated, info = self.env.step(actions)
         # A step that was a reset has no time steps, and no reward.
-        steps = 1 if self._repeater is None else np.maximum(self._repeater.steps_taken, 1)
+        steps: Any = 1 if self._repeater is None else np.maximum(self._repeater.steps_taken, 1)
+        if left is not None:
+            diverged = info.get("final_info", info).get("diverged", False)
+            steps = np.where(terminated | (truncated & diverged), left, steps)
         shaped = self._shaping.of_steps(self.unshaped, steps)
         if self._shaping.counts_ends and (ended := terminated | truncated).any():
             shaped[ended] += self._shaping.of_ends(info.get("final_info", info))[ended]

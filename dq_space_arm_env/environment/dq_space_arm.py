@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
@@ -502,6 +503,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         given = checked_options(options)
         saved = saved_state(given)
         if saved is not None:
+            if seed is not None:
+                seeding.np_random(seed)  # if it is refused, nothing has changed
             self.set_state(saved)
             super().reset(seed=seed)
         else:

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
@@ -210,6 +211,7 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
         Returns:
             Arrays by name, see `DQSpaceArmEnv.get_state`.
         """
+        self._env.np_random = self.np_random  # a copy, or a caller, may have given this one another
         return {**self._env.get_state(), "truncated": np.array(self._truncated)}
 
     def set_state(self, state: Mapping[str, Array]) -> None:
@@ -251,6 +253,8 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
             given_start(self.kernels, given)  # if it is refused, nothing has changed
             self._truncated = False
         else:
+            if seed is not None:
+                seeding.np_random(seed)  # if it is refused, nothing has changed
             self.set_state(saved)
         super().reset(seed=seed)
         self._env.np_random = self.np_random

@@ -148,4 +148,7 @@ def _diverged(info: Info | Sequence[Info] | NDArray[Any] | None) -> bool | NDArr
         return False
     if isinstance(info, Mapping):
         return np.asarray(info.get("diverged", False), dtype=np.bool_)
-    return np.array([bool(entry.get("diverged", False)) for entry in info])
+    try:
+        return np.array([bool(entry.get("diverged", False)) for entry in info])
+    except (AttributeError, TypeError) as error:
+        raise ValueError(f"info: {shortened(info)}, should be a dictionary, or one for each goal") from error

@@ -215,8 +215,9 @@ def rollout(
             measured = displaced(environment.kernels, log.state, disturbance.measurement)
         if measured is not known and observes:
             observation = environment.observe(measured)
+        given = np.array(measured if isinstance(policy, StateFeedback) else observation)  # its own to change
         began = perf_counter()
-        asked = policy.act(measured, step) if isinstance(policy, StateFeedback) else policy(observation)
+        asked = policy.act(given, step) if isinstance(policy, StateFeedback) else policy(given)
         log.action_seconds[step] = perf_counter() - began
         waiting.append(np.array(real_array("actions of the policy", asked)))
         actions = log.before_step(step, observation, waiting.popleft(), disturbance.inputs)

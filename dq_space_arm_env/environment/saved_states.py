@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.scene import Scene, list_scenes
+from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
 
 Array = NDArray[Any]
 
@@ -54,8 +55,8 @@ def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array], steps
 
     Raises:
         ValueError: If the state is no mapping, an array is missing, has another shape or type, or numbers
-            that are not finite, or the memory counts a number of steps that an episode of so many does not
-            have, or goes on after.
+            that are not finite, or so large that an episode would have diverged, or the memory counts a
+            number of steps that an episode of so many does not have, or goes on after.
     """
     if not isinstance(state, Mapping):
         raise ValueError(
@@ -82,4 +83,9 @@ def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array], steps
         # A payload that the tip has not let go is adrift since NaN.
         if name != "adrift" and array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"state: {name} {shortened(array)}, should be finite numbers")
+        if name == "x" and np.abs(array).max(initial=0.0) > OBSERVATION_LIMIT:
+            raise ValueError(
+                f"state: x {shortened(array)}, should be at most {OBSERVATION_LIMIT:g} in size, before which "
+                "an episode has diverged"
+            )
     return found

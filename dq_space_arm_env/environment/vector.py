@@ -36,7 +36,7 @@ from dq_space_arm_env.environment.specification import (
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, load_scene
-from dq_space_arm_env.task.step_report import grouped, report_names
+from dq_space_arm_env.task.step_report import STATE_LIMIT, grouped, report_names
 from dq_space_arm_env.viewing.payload_places import Payloads, leaves_tip
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.trails import Trails
@@ -217,17 +217,18 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         saved = saved_state(rest)
         if saved is None:
             starts, first = self._given_starts(rows, rest), not self._begun
-            self._seed(seed, rows)
+            self._seed(seed, self._checked_seeds(seed), rows)
             self._envs.begin(rows, starts)
             if first and len(others):
                 self._envs.begin(others, given_start(self.kernels, {"nominal": True}))
                 self._remember(self.observe())
             self._over = np.setdiff1d(self._over, rows)
             self._begin_trails(rows)
-            self._extend_trails()
+            self._extend_trails(np.arange(self.num_envs) if first else rows)
         else:
+            seeds = self._checked_seeds(seed)  # if one is refused, nothing has changed
             self.set_state(self._given_state(saved, rows), rows)
-            self._seed(seed, rows)
+            self._seed(seed, seeds, rows)
         result = self._envs.observe(rows)
         self._show_again(others, result)
         result.report[:, others], result.flags[:, others] = 0.0, False
@@ -259,8 +260,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             )
         return mask
 
-    def _seed(self, seed: int | Sequence[int | None] | None, rows: Rows) -> None:
-        """Seed the generators that are given a seed or have none yet."""
+    def _checked_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """A seed, or None, for each sub-environment."""
+        seeds: list[int | None]
         if seed is None or isinstance(seed, (int, np.integer)):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         elif isinstance(seed, Iterable):
@@ -272,6 +274,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         for each in seeds:
             if each is not None and not (isinstance(each, int | np.integer) and each >= 0):
                 raise ValueError(f"seed: {shortened(each)}, should be a whole number of at least 0, or None")
+        return seeds
+
+    def _seed(self, seed: int | Sequence[int | None] | None, seeds: Sequence[int | None], rows: Rows) -> None:
+        """Seed the generators that are given a seed or have none yet."""
         if isinstance(seed, int | np.integer):
             super().reset(seed=int(seed))  # np_random, which nothing is drawn from here, and np_random_seed
         if not self._begun:
@@ -342,7 +348,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             else:
                 self._over = rows
         self._remember(result.observation)
-        self._extend_trails()
+        self._extend_trails(np.arange(self.num_envs))
         info = self._info(result, self._all) | final
         if len(begun):
             info |= self._drawn(begun)
@@ -359,7 +365,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         Raises:
             ResetNeeded: Before the first reset.
             TypeError: If the increments are masked, or not of real numbers.
-            ValueError: If the increments have a wrong shape, or are not finite.
+            ValueError: If the increments have a wrong shape, or are not finite or beyond 5e5 in norm.
         """
         self._require_reset("perturb()")
         increments = real_array("increments", increments, np.float64)
@@ -368,6 +374,13 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             raise ValueError(f"increments: shape {increments.shape}, should be {expected}")
         if not np.isfinite(increments).all():
             raise ValueError(f"increments: {shortened(increments)}, should be finite")
+        with np.errstate(over="ignore"):
+            largest = np.linalg.norm(increments, axis=1).max()
+        if largest > STATE_LIMIT:
+            raise ValueError(
+                f"increments: a norm of {largest:.3g}, should be at most {STATE_LIMIT:g}, beyond which a "
+                "simulation counts as diverged"
+            )
         rows = np.flatnonzero(increments.any(axis=1))
         if len(rows):
             self._envs.move(rows, displaced(self.kernels, self._envs.x[rows], increments[rows]))
@@ -440,7 +453,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         self._begun, self._over = True, np.flatnonzero(kept["over"])
         if observes and self._seen is not None:
             self._seen[chosen] = self.observe()[chosen]
-        self._extend_trails()
+        self._extend_trails(chosen)
 
     def _kept(self) -> dict[str, Array]:
         """Arrays that all later steps depend on; "over" is made anew."""
@@ -491,11 +504,11 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         if self._payloads is not None:
             self._payloads.adrift[rows] = np.nan
 
-    def _extend_trails(self) -> None:
-        """Keep what later pictures show of the present, and where payloads are let go."""
+    def _extend_trails(self, rows: Rows) -> None:
+        """Keep what later pictures show of the present in some episodes, and where payloads are let go."""
         if self._trails is not None:
-            tips = self.kernels.tip_pose(self._envs.x)
-            self._trails.append(np.array(poses.position(tips.T)).T)
+            tips = self.kernels.tip_pose(self._envs.x[rows])
+            self._trails.extend(rows, np.array(poses.position(tips.T)).T)
         if self._payloads is not None:
             self._payloads.follow(self._envs.x, self._envs.kept()["memory"])
 

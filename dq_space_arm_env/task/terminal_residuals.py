@@ -122,16 +122,19 @@ def charged(scene: Scene, residuals: Scalars, at_end: Scalar) -> tuple[Scalar, S
     Args:
         scene: The scene.
         residuals: Those of `reported`.
-        at_end: Whether the episode ends: what is exact at the end is charged then.
+        at_end: Whether the episode ends anyway: what is exact at the end is charged then, or when a
+            violation ends it.
 
     Returns:
         The sum, dimensionless, and a truth value.
     """
     cost, ends = 0.0, False
     rows = (*path_rows(scene), *exact_rows(scene))
+    for row, c in zip(rows, residuals, strict=True):
+        if row.terminates:
+            ends = casadi.logic_or(ends, c > row.tolerance)
+    at_end = casadi.logic_or(at_end, ends)
     for row, c in zip(rows, residuals, strict=True):  # NaN stays: maxima are the second number then
         violation = casadi.if_else(at_end, casadi.fabs(c), 0.0) if row.is_equality else casadi.fmax(0.0, c)
         cost = cost + violation / row.tolerance
-        if row.terminates:
-            ends = casadi.logic_or(ends, c > row.tolerance)
     return cost, ends

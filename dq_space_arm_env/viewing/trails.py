@@ -14,20 +14,18 @@ class Trails:
     """A trail of tip positions for each of `count` episodes, which begins with the episode."""
 
     def __init__(self, count: int) -> None:
-        self._positions: list[Array] = []
-        self._starts = np.zeros(count, dtype=np.int64)
+        self._positions: list[list[Array]] = [[] for _ in range(count)]
 
     def begin(self, rows: NDArray[np.int64]) -> None:
         """Clear the trails of some episodes."""
-        self._starts[rows] = len(self._positions)
+        for row in rows.tolist():
+            self._positions[row] = []
 
-    def append(self, positions: Array) -> None:
-        """Add positions, shape (count, 3), m, and drop those that belong to no trail any longer."""
-        self._positions.append(positions)
-        oldest = int(self._starts.min())
-        del self._positions[:oldest]
-        self._starts -= oldest
+    def extend(self, rows: NDArray[np.int64], positions: Array) -> None:
+        """Add positions of some episodes, shape (len(rows), 3), m."""
+        for row, position in zip(rows.tolist(), positions, strict=True):
+            self._positions[row].append(position)
 
     def of(self, row: int) -> Array:
         """Trail of an episode, oldest first, shape (m, 3), m."""
-        return np.array([positions[row] for positions in self._positions[self._starts[row] :]])
+        return np.array(self._positions[row]).reshape(-1, 3)

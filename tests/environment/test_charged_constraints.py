@@ -119,6 +119,21 @@ def test_a_violation_may_end_the_episode_and_never_pays():
         DQSpaceArmGoalEnv(ending)
 
 
+def test_what_is_exact_at_the_end_is_charged_at_an_early_one_too():
+    limits = {**LIMITS, "lower": [-0.7, -math.inf, -math.inf], "terminates": True}
+    env = DQSpaceArmEnv(scene(limits, EXACT, name="planar"))
+    env.reset(options={"nominal": True})
+    action, over, steps = np.zeros(env.action_space.shape), False, 0
+    action[3] = -1.0  # link 1 turns to its limit
+    while not over:
+        _, _, over, _, info = env.step(action)
+        steps += 1
+    assert steps < 40
+    limit, *exact = info["constraints"].values()
+    charged = limit / 0.05 + sum(abs(each) for each in exact) / 0.1
+    assert info["cost"] == pytest.approx(charged, rel=1e-12)
+
+
 def test_rollouts_count_violations():
     flown = rollout(lambda seen: np.zeros((len(seen), 12)), CONSTRAINED, seeds=range(4))
     env, expected = DQSpaceArmEnv(CONSTRAINED), []

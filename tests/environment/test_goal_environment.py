@@ -98,6 +98,9 @@ def test_an_info_that_says_nothing_of_a_divergence_reports_none():
     lost = env.compute_reward(achieved, desired, {"diverged": np.array([False, True])})
     assert lost[0] == sound[0]
     assert lost[1] < sound[1]
+    for odd in ([None, None], "no", 3):
+        with pytest.raises(ValueError, match=r"info: .* should be a dictionary, or one for each goal"):
+            env.compute_reward(achieved, desired, odd)
 
 
 @pytest.mark.sampled

@@ -75,6 +75,18 @@ def test_nan_makes_a_policy_fail_and_the_others_go_on(scene):
         rollout(lambda observations: np.zeros(6), scene, [1, 2])
 
 
+def test_what_a_policy_does_to_its_observations_is_its_own_affair(scene):
+    def in_place(seen, step=0):
+        seen[:] = 0.0
+        return np.zeros((1, 6))
+
+    resting = rollout(lambda observations: np.zeros((1, 6)), scene, steps=4, record=True)
+    for policy in (in_place, StateFeedback(in_place)):
+        flown = rollout(policy, scene, steps=4, record=True)
+        np.testing.assert_array_equal(flown.states, resting.states)
+        np.testing.assert_array_equal(flown.observations, resting.observations)
+
+
 def test_diverged_episode_ends_early_and_is_charged_like_in_the_environment(scene):
     layout = compile_scene(scene).layout
     fast, calm = layout.initial_state.copy(), layout.initial_state

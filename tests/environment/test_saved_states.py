@@ -120,6 +120,17 @@ def test_reset_goes_on_with_a_state(kind):
     assert_same(other.reset(), gymnasium.make(kind, scene=DRAWN).reset(seed=7))
 
 
+def test_a_copy_of_a_goal_environment_saves_the_generator_that_it_draws_from():
+    env = DQSpaceArmGoalEnv(DRAWN)
+    env.reset(seed=1)
+    copied = copy.deepcopy(env)
+    copied.np_random.random(5)
+    state = copied.get_state()
+    expected, _ = copied.reset()
+    env.set_state(state)
+    assert_same(env.reset()[0], expected)
+
+
 def test_the_episodes_scene_and_target_come_along():
     env, other = DQSpaceArmEnv(DRAWN), DQSpaceArmEnv(DRAWN)
     env.reset(seed=3)
@@ -251,6 +262,11 @@ def test_bad_states_are_refused_and_change_nothing():
             bad[..., -1] = np.nan
             with pytest.raises(ValueError, match=f"(?s)state: {name} .*should be finite numbers"):
                 each.set_state({**state, name: bad})
+        with pytest.raises(ValueError, match=r"(?s)state: x .*should be at most 1e"):
+            each.set_state({**state, "x": state["x"] + 2e6})
+        for seed in (-1, [1]):  # once with the episode's own state, once with another
+            with pytest.raises((ValueError, gymnasium.error.Error), match=r"(?i)seed"):
+                each.reset(seed=seed, options={"state": {**state, "x": state["x"] + 0.01}})
         assert_same(each.get_state(), state)
     for rows in ([3], [0, 0], [[True]], "x", True, [[0, 1]]):
         with pytest.raises(ValueError, match="rows: "):

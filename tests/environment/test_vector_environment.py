@@ -245,6 +245,7 @@ def test_what_a_caller_does_to_results_does_not_matter():
         (lambda v: v.reset(options={"reset_mask": [True] * 4}), "should be a bool array"),
         (lambda v: v.reset(options={"nominel": True}), r"\['nominel'\] unknown; choose from nominal"),
         (lambda v: v.perturb(np.full((4, v.kernels.n_t), np.inf)), "should be finite"),
+        (lambda v: v.perturb(np.full((4, v.kernels.n_t), 1e200)), "a norm of inf, should be at most 500000"),
     ],
 )
 def test_bad_input_is_refused(call, message):

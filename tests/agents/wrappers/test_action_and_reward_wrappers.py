@@ -15,6 +15,7 @@ from agents.wrappers import RepeatAction, ShapeReward, ShrinkActionSpace, vector
 from dq_space_arm_env import load_scene
 
 PAPER = load_scene("paper")
+PLANAR = load_scene("planar").replace(simulation={"steps": 200, "dt": 0.05})
 EIGHT_STEPS = PAPER.replace(simulation={"steps": 8})
 LINKS = [link.model_dump() | {"stiffness": 200.0} for link in PAPER.links]
 BOUNDS = {"kind": "joint_limits", "name": "bounds", "upper": [0.0, 1.5, 0.0]}
@@ -167,6 +168,31 @@ def test_the_mean_of_a_short_decision_is_that_of_its_own_steps(repeats, lengths)
         _, reward, over, _, _ = env.step(STILL)
         assert reward == pytest.approx(-3.0 * steps * np.sqrt(-env.unshaped / steps), rel=1e-6)
     assert over
+
+
+@pytest.mark.parametrize("repeat", [1, 20])
+def test_an_early_end_never_pays_whatever_the_power(repeat):
+    """Its charge for all remaining steps is shaped as theirs would have been."""
+    held_back = {
+        "kind": "joint_limits",
+        "name": "limits",
+        "lower": [-0.7, -np.inf, -np.inf],
+        "tolerance": 0.05,
+    }
+    returns = []
+    for terminates in (True, False):
+        scene = PLANAR.replace(constraints=[{**held_back, "terminates": terminates}])
+        env = ShapeReward(RepeatAction(gymnasium.make("DQSpaceArm-v0", scene=scene), repeat), power=0.5)
+        env.reset(options={"nominal": True})
+        action, over, rewards = np.zeros(env.action_space.shape), False, []
+        action[3] = -1.0  # link 1 turns to its limit
+        while not over:
+            _, reward, over, _, _ = env.step(action)
+            rewards.append(reward)
+        returns.append(rewards)
+    ended, flown = returns
+    assert 1 < len(ended) < len(flown)
+    assert sum(ended) < sum(flown)
 
 
 def last_rewards(env):
