@@ -19,10 +19,10 @@ def shortened(value: object, longest: int = LONGEST) -> str:
     return text if len(text) <= longest else f"{text[:longest]}..."
 
 
-def yaml_like(value: object, longest: int = LONGEST) -> str:
+def yaml_like(value: object) -> str:
     """Write a value as `shortened` does, but mappings, null, true and false as YAML has them."""
-    text = _YAMLCut(longest).repr(value)
-    return text if len(text) <= longest else f"{text[:longest]}..."
+    text = _YAMLCut(LONGEST).repr(value)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 class _Cut(Repr):

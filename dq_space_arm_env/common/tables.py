@@ -177,11 +177,9 @@ def tabulate(title: str, rows: Iterable[Row], columns: Iterable[Column | str] | 
     )
 
 
-def plain_table(
-    title: str, headings: Iterable[str], rows: Iterable[Iterable[str]], right: int | None = None
-) -> ConsoleRenderable:
-    """Make a table of plain text for the terminal; columns from `right` on are flush right."""
-    return TextTable(title, tuple(headings), tuple(tuple(row) for row in rows), right).for_terminal()
+def plain_table(title: str, headings: Iterable[str], rows: Iterable[Iterable[str]]) -> ConsoleRenderable:
+    """Make a table of plain text for the terminal."""
+    return TextTable(title, tuple(headings), tuple(tuple(row) for row in rows)).for_terminal()
 
 
 def one_line(text: str) -> str:

@@ -138,7 +138,6 @@ def lathe(
     profile: Sequence[tuple[float, float]],
     colors: Color | Sequence[Color],
     sides: int = 24,
-    shine: float = SHINE,
     smooth: bool = False,
 ) -> Mesh:
     """Surface of revolution: cylinders, cones, disks and balls.
@@ -170,7 +169,7 @@ def lathe(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     bands = len(profile) - 1
     per_band = np.repeat(np.broadcast_to(np.array(colors), (bands, 3)), sides, axis=0)
-    return _uniform(frame, corners, normals, _quadrilaterals(lower, upper), per_band, shine)
+    return _uniform(frame, corners, normals, _quadrilaterals(lower, upper), per_band, SHINE)
 
 
 def _quadrilaterals(lower: Array, upper: Array) -> Array:
