@@ -37,8 +37,16 @@ _POLICIES = frozenset(
 )
 """Modules whose policies act as this file computes."""
 _SCALED_ACTIONS = "agents.reinforcement.networks"  # an output of 1 means the bound of the box
-_EXTRACTORS = ("FlattenExtractor", "CombinedExtractor", "ScaledObservations")
-_ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "SiLU": "silu"}
+_EXTRACTORS = (
+    "stable_baselines3.common.torch_layers.FlattenExtractor",
+    "stable_baselines3.common.torch_layers.CombinedExtractor",
+    "agents.reinforcement.networks.ScaledObservations",
+)
+_ACTIVATIONS = {
+    "torch.nn.modules.activation.Tanh": "tanh",
+    "torch.nn.modules.activation.ReLU": "relu",
+    "torch.nn.modules.activation.SiLU": "silu",
+}
 
 
 class ModelArchiveError(ValueError):
@@ -205,7 +213,9 @@ def _checked_options(data: Mapping[str, Any]) -> Mapping[str, Any]:
         raise NeedsCodeError("its actions depend on state-dependent exploration")
     extractor = _class_name(options.get("features_extractor_class", _EXTRACTORS[0]))
     if extractor not in _EXTRACTORS:
-        raise NeedsCodeError(f"its observations go through {extractor!r}")
+        raise NeedsCodeError(
+            f"its observations go through {extractor!r}, not through one of {', '.join(_EXTRACTORS)}"
+        )
     return dict(options)
 
 
@@ -298,5 +308,5 @@ def _activation(options: Mapping[str, Any], default: str) -> str:
 
 
 def _class_name(text: Any) -> str:
-    """The name in `<class 'package.module.Name'>`."""
-    return str(text)[:200].removesuffix("'>").rpartition(".")[2]
+    """The full name in `<class 'package.module.Name'>`; a user's class may share the last part."""
+    return str(text)[:200].removeprefix("<class '").removesuffix("'>")

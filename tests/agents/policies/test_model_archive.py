@@ -16,6 +16,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 from sb3_contrib import TQC, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common import torch_layers
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from agents import DQSpaceArmVecEnv, ExportedPolicy
@@ -31,6 +32,20 @@ NETWORK = {"net_arch": [16, 16]}
 
 class OwnPolicy(ActorCriticPolicy):
     """Acts in its own way."""
+
+
+class FlattenExtractor(torch_layers.FlattenExtractor):
+    """Has the name of another class, and does something else."""
+
+    def forward(self, observations):
+        return torch.tanh(super().forward(observations))
+
+
+class Tanh(torch.nn.Module):
+    """Has the name of another class, and does something else."""
+
+    def forward(self, values):
+        return torch.sin(values)
 
 
 class Bomb:
@@ -182,9 +197,27 @@ def test_the_tensors_act_like_the_model(name, hidden, small_scene, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "options",
+    [{"features_extractor_class": torch_layers.FlattenExtractor}, {"activation_fn": torch.nn.SiLU}],
+)
+def test_known_classes_that_the_file_names_act_like_the_model(options, small_scene, tmp_path):
+    model = learner(PPO, small_scene, policy_kwargs={**NETWORK, **options})
+    model.save(tmp_path / "model.zip")
+    seen = np.random.default_rng(0).normal(size=(50, 14)).astype(np.float32)
+    expected = np.clip(model.predict(seen, deterministic=True)[0], -1.0, 1.0)
+    np.testing.assert_allclose(as_policy(tmp_path / "model.zip").act(seen), expected, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
     ("kind", "options", "reason"),
     [
-        (PPO, {"policy_kwargs": {**NETWORK, "activation_fn": torch.nn.ELU}}, "its activation is 'ELU'"),
+        (PPO, {"policy_kwargs": {**NETWORK, "activation_fn": torch.nn.ELU}}, "its activation is .*ELU'"),
+        (PPO, {"policy_kwargs": {**NETWORK, "activation_fn": Tanh}}, "its activation is .*Tanh', not one of"),
+        (
+            PPO,
+            {"policy_kwargs": {**NETWORK, "features_extractor_class": FlattenExtractor}},
+            "its observations go through .*FlattenExtractor', not through one of",
+        ),
         (SAC, {"use_sde": True}, "state-dependent exploration"),
         (PPO, {"policy": OwnPolicy}, "its policy is a class of"),
     ],
