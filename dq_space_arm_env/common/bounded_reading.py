@@ -16,7 +16,7 @@ from typing import IO, Any
 from dq_space_arm_env.common.shown_text import LONGEST, shortened
 
 TEXT_BYTES = 8 * 2**20
-"""Default limit of a text: the manifest of a million demonstrations, parsed in half a second."""
+"""Default limit of a text, which is parsed in half a second."""
 ANY_SIZE = 2**63
 """Limit of files that are mapped, or read in parts."""
 DEPTH = 64

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping, read_text
+from dq_space_arm_env.common.bounded_reading import TEXT_BYTES, UnreadableError, read_mapping, read_text
 from dq_space_arm_env.common.shown_text import shortened
 from experts.demonstrations.folder import (
     MANIFEST,
@@ -18,6 +18,7 @@ from experts.demonstrations.folder import (
 from experts.demonstrations.settings import FORMAT
 from experts.demonstrations.tensors import DemonstrationsError
 
+_MANIFEST_BYTES = 2**28  # a million shards
 _REMEDY = "run the command that made the folder again to repair it"
 _Fields = Mapping[str, tuple[type, str]]
 _SETTINGS: _Fields = {
@@ -51,7 +52,7 @@ def checked_descriptions(folder: Path, verify: bool) -> tuple[dict[str, Any], di
         raise DemonstrationsError(
             f"{folder} is not complete: it has no {MANIFEST}; run the command that began it again to resume"
         )
-    settings, manifest = (_read_json(folder / name) for name in (SETTINGS, MANIFEST))
+    settings, manifest = _read_json(folder / SETTINGS), _read_json(folder / MANIFEST, _MANIFEST_BYTES)
     if settings.get("format") != FORMAT:
         raise DemonstrationsError(
             f"{folder} has format {shortened(settings.get('format'))}, this version reads {FORMAT}: generate "
@@ -71,9 +72,9 @@ def checked_descriptions(folder: Path, verify: bool) -> tuple[dict[str, Any], di
     return settings, manifest
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _read_json(path: Path, most: int = TEXT_BYTES) -> dict[str, Any]:
     try:
-        return read_mapping(path)
+        return read_mapping(path, most)
     except UnreadableError as error:
         raise DemonstrationsError(f"{path} cannot be read ({error}); generate it again") from error
 
@@ -122,7 +123,7 @@ def _verify_descriptions(folder: Path, paths: list[Path], manifest: Mapping[str,
         )
     try:
         made = manifest_text(manifest_of(folder / SETTINGS, paths))
-        kept = read_text(folder / MANIFEST)
+        kept = read_text(folder / MANIFEST, _MANIFEST_BYTES)
     except (KeyError, TypeError, ValueError) as error:
         raise DemonstrationsError(
             f"{folder}: a shard has other arrays than a shard should ({error})"

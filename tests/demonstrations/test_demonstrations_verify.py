@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from demonstration_files import replace_first_shard, rewrite
 
+from dq_space_arm_env.common.bounded_reading import TEXT_BYTES
 from experts import load_demonstrations
 from experts.demonstrations import DemonstrationsError
 
@@ -24,6 +25,13 @@ def refusal(folder: Path, **options: bool) -> str:
 
 def test_a_sound_folder_is_verified(folder: Path) -> None:
     assert len(load_demonstrations(folder, verify=True)) == 18
+
+
+def test_the_manifest_of_many_shards_is_read(folder: Path) -> None:
+    path = folder / "manifest.json"
+    path.write_text(path.read_text() + " " * TEXT_BYTES)  # as large as that of 31,000 shards
+    assert len(load_demonstrations(folder)) == 18
+    assert "manifest.json is damaged" in refusal(folder, verify=True)
 
 
 def test_edited_settings_are_found(folder: Path) -> None:
