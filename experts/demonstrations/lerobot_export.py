@@ -88,7 +88,9 @@ def export_to_lerobot(
         raise DemonstrationsError(LEROBOT_MISSING) from error
     if not len(demonstrations):
         raise DemonstrationsError(f"{demonstrations.path} has no demonstration to export")
-    place = Path(os.path.abspath(out))  # noqa: PTH100 - resolve would follow links
+    place = Path(os.path.abspath(out))  # noqa: PTH100 - resolve would follow links of parents too
+    if place.is_symlink():
+        place = place.resolve()  # else the link would be replaced, and what it leads to would stay
     staging = place.with_name(f".{place.name}.part")
     name = f"the LeRobot data set {place}"
     try:

@@ -20,7 +20,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import gymnasium
@@ -45,6 +45,7 @@ PADDING, MARGIN = 1.3, 2**25
 MINARI_MISSING = 'this needs Minari: pip install "dq-space-arm[minari]" ({} is missing)'
 # Minari knows no namespace of one character.
 _ID = re.compile(r"(?![-\w]/[^/]*$)([-\w]+/)*[-\w]+-v\d+")
+_PARTS = ("data", CARD, "namespace_metadata.json")
 _FOLDER_VARIABLE = "MINARI_DATASETS_PATH"
 _DESCRIPTION = """\
 {count} optimal maneuvers of scene {name!r} in DQSpaceArm-v0, from random starts: converged, successful, \
@@ -156,11 +157,20 @@ def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     from minari.namespace import create_namespace, list_local_namespaces
     from minari.storage import get_dataset_path
 
+    for above in PurePosixPath(dataset_id).parents:
+        if above.name and (get_dataset_path(str(above)) / "data" / "metadata.json").exists():
+            raise DemonstrationsError(
+                f"dataset_id: {dataset_id!r} is in the data set {above}, with which it would be deleted; "
+                "choose another namespace"
+            )
     place = get_dataset_path(dataset_id)
     staging = get_dataset_path() / f".{dataset_id.replace('/', '.')}.part"  # no other name has a dot
+    if place.is_symlink():
+        place = place.resolve()  # else the link would be replaced, and what it leads to would stay
+        staging = place.with_name(f".{place.name}.part")
     name = f"the Minari data set {dataset_id}"
     # A folder without data is a namespace that holds other data sets.
-    with staged(place, staging, marker="data", overwrite=overwrite, name=name) as made:
+    with staged(place, staging, marker="data", overwrite=overwrite, name=name, parts=_PARTS) as made:
         yield staging
         namespace = dataset_id.rpartition("/")[0]
         if namespace and namespace not in list_local_namespaces():
@@ -248,7 +258,7 @@ def _check_space(folder: Path, size: int) -> None:
     """Fail early where space is short: on a full disk the HDF5 library aborts the process."""
     needed, free = PADDING * size + MARGIN, shutil.disk_usage(folder).free
     if free < needed:
-        raise OSError(f"the disk has {free / 1e9:.1f} GB left, but {needed / 1e9:.1f} GB are needed")
+        raise OSError(f"the disk has {free / 1e6:,.0f} MB left, but {needed / 1e6:,.0f} MB are needed")
 
 
 def _infos(

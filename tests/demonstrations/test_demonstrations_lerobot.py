@@ -167,6 +167,15 @@ def test_an_existing_data_set_is_only_replaced_when_asked(whole: Demonstrations,
     assert (tmp_path / "other" / "work.txt").read_text() == "mine"
 
 
+def test_a_link_is_followed(whole: Demonstrations, tmp_path: Path):
+    place = export_to_lerobot(whole[:2], tmp_path / "a" / "set")
+    (tmp_path / "link").symlink_to(place)
+    assert export_to_lerobot(whole[:3], tmp_path / "link", overwrite=True) == place
+    assert (tmp_path / "link").is_symlink()
+    assert information(place)["total_episodes"] == 3
+    assert [path.name for path in place.parent.iterdir()] == ["set"]
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_what_stops_half_way_leaves_nothing(whole: Demonstrations, tmp_path: Path, error: BaseException):
     export_to_lerobot(whole[:2], tmp_path / "set")

@@ -198,6 +198,29 @@ def test_a_namespace_is_not_overwritten(whole: Demonstrations, root: Path):
     assert list(minari.list_local_datasets()) == ["space-v0/quick-v0"]
 
 
+@pytest.mark.slow
+def test_a_data_set_is_not_deleted_with_another(whole: Demonstrations, root: Path):
+    place = export_to_minari(whole[:1], ID, card="# Card").storage.data_path.parent
+    assert {path.name for path in place.iterdir()} == {"data", "README.md"}
+    with pytest.raises(DemonstrationsError, match=f"is in the data set {ID}, with which it would be deleted"):
+        export_to_minari(whole[:1], f"{ID}/more/other-v0")
+    (place / "other-v0").mkdir()  # which another program made
+    with pytest.raises(DemonstrationsError, match="it holds 'other-v0' too, so it is not overwritten"):
+        export_to_minari(whole[:1], ID, overwrite=True)
+    assert (place / "other-v0").is_dir()
+
+
+@pytest.mark.slow
+def test_a_link_is_followed(whole: Demonstrations, root: Path):
+    place = export_to_minari(whole[:2], ID).storage.data_path.parent
+    elsewhere = place.rename(root.parent / "elsewhere")
+    place.symlink_to(elsewhere)
+    assert export_to_minari(whole[:1], ID, overwrite=True).total_episodes == 1
+    assert place.is_symlink()
+    assert {path.name for path in root.parent.iterdir()} == {"minari", "elsewhere"}
+    assert [path.name for path in root.iterdir()] == ["space-arm"]
+
+
 def test_two_processes_do_not_write_the_same_data_set(whole: Demonstrations, root: Path):
     (root / STAGING).mkdir(parents=True)
     with (
@@ -219,7 +242,7 @@ def test_a_disk_without_room_is_refused_before_hdf5_finds_out(
     whole: Demonstrations, root: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=2**20))
-    with pytest.raises(DemonstrationsError, match=r"the disk has 0\.0 GB left"):
+    with pytest.raises(DemonstrationsError, match=r"the disk has 1 MB left, but \d\d MB are needed"):
         export_to_minari(whole, ID)
     assert list(root.iterdir()) == []
 
