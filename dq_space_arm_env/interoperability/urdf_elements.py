@@ -27,7 +27,7 @@ from dq_space_arm_env.interoperability.rigid_body import Array, Body
 from dq_space_arm_env.scene import SceneError
 
 MOVABLE = ("revolute", "continuous", "prismatic")
-TYPES = (*MOVABLE, "fixed", "planar", "floating")
+TYPES = (*MOVABLE, "fixed", "planar", "floating")  # the last two where they move no mass
 
 _MOST = 10_000  # links or joints, a hundred times those of a humanoid
 _LONGEST_NAME = 200  # characters
@@ -192,10 +192,11 @@ def _read_joint(element: Element) -> UrdfJoint:
     where = f"joint {name!r}"
     kind = element.get("type", "")
     if kind not in TYPES:
-        raise SceneError(f"URDF: {where}: type = {shortened(kind)}, it must be one of {', '.join(TYPES)}")
+        known = f"{', '.join(TYPES[:-2])}, or where it moves no mass {' or '.join(TYPES[-2:])}"
+        raise SceneError(f"URDF: {where}: type = {shortened(kind)}, it must be one of {known}")
     unit = "m" if kind == "prismatic" else "rad"
     limit, dynamics, mimic = (_only(element, tag, where) for tag in ("limit", "dynamics", "mimic"))
-    effort = _optional(limit, "effort", f"{where}, <limit>")
+    effort = _limit(limit, "effort", where)
     damping, friction = (_optional(dynamics, key, f"{where}, <dynamics>") for key in ("damping", "friction"))
     for key, value in (("effort", effort), ("damping", damping), ("friction", friction)):
         if value < 0:
@@ -221,7 +222,7 @@ def _read_joint(element: Element) -> UrdfJoint:
 
 def _limits(limit: Element | None, where: str, unit: str) -> tuple[float, float] | None:
     """Smallest and largest coordinate; none where both are 0, which many files write for unknown."""
-    lower, upper = (_optional(limit, key, f"{where}, <limit>") for key in ("lower", "upper"))
+    lower, upper = (_limit(limit, key, where) for key in ("lower", "upper"))
     if lower > upper:
         raise SceneError(f"URDF: {where}: lower = {lower:g} {unit} is greater than upper = {upper:g} {unit}")
     if lower == upper == 0.0:
@@ -231,10 +232,18 @@ def _limits(limit: Element | None, where: str, unit: str) -> tuple[float, float]
 
 def _rate(limit: Element | None, where: str, unit: str) -> float:
     """Largest rate; none where it is 0, which many files write for unknown."""
-    rate = _optional(limit, "velocity", f"{where}, <limit>")
+    rate = _limit(limit, "velocity", where)
     if rate < 0:
         raise SceneError(f"URDF: {where}: velocity = {rate:g} {unit}/s, it must be 0 or greater")
     return rate if 0.0 < rate < UNLIMITED else math.inf
+
+
+def _limit(limit: Element | None, key: str, where: str) -> float:
+    """A limit of any size: simulators write 1e16, or the largest number there is, for none."""
+    if limit is None or key not in limit.attrib:
+        return 0.0
+    where = f"{where}, <limit>"
+    return _numbers(_required(limit, key, where), 1, key, where, largest=math.inf)[0]
 
 
 def _axis(element: Element, where: str) -> Array:

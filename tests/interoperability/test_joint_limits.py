@@ -79,6 +79,7 @@ def test_limits_become_a_constraint():
         (arm(limit(0, 0, 0)), None),  # placeholders
         (arm(limit()), None),
         (arm(limit(-1e9, 2e4, 10000)), None),
+        (arm(limit(-1e16, "1.79769e+308", "1.79769e+308")), None),
         (arm(limit(-1, 2, 0), kind="continuous"), None),  # a continuous joint has no range
         (arm(limit(0, 0, 2)), (-INF, INF, 2.0)),
         (arm(limit(-1, 2, 1.5), kind="continuous"), (-INF, INF, 1.5)),
