@@ -73,6 +73,9 @@ class Folder:
             raise DemonstrationsError(
                 f"{self.path} has a {CARD} of its own, which the data card would replace; choose a new folder"
             )
+        there = next(path for path in (self.path, *self.path.parents) if path.exists())
+        if not there.is_dir():
+            raise DemonstrationsError(f"out: {there} is a file, it should be a folder; choose another")
         for folder in (self.path, self.path / SHARDS, self.path / LOG):
             folder.mkdir(parents=True, exist_ok=True)
         with _reserved(self.path, self.part, self._remove_leftovers, self._check_settings):

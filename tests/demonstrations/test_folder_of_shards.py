@@ -53,6 +53,17 @@ def test_a_readme_of_somebody_else_is_not_replaced(quick_scene: Scene, tmp_path:
     assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
 
 
+def test_a_file_is_no_folder(quick_scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    for path in (tmp_path / "file", tmp_path / "file" / "folder"):
+        with (
+            pytest.raises(DemonstrationsError, match=r"^out: .*file is a file, it should be a folder"),
+            folder_of(quick_scene, path).opened(),
+        ):
+            pass
+    assert (tmp_path / "file").read_text() == "mine"
+
+
 def test_sound_shards_are_those_that_their_names_say(quick_scene: Scene, tmp_path: Path) -> None:
     folder = folder_of(quick_scene, tmp_path)
     with folder.opened():
