@@ -1,7 +1,7 @@
 """Bodies of a scene: base, links, wrist and payload, and the physics that constrains their numbers."""
 
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -101,6 +101,11 @@ class Link(Model):
     its rates and torques have three components in the link's axes, and its spring pulls along the rotation
     vector. A fixed one makes link and parent one body.
     """
+
+    _elsewhere: ClassVar[Mapping[str, str]] = {
+        "axis": "a joint turns about the z axis of its frame: turn that with joint.rotation, a quaternion or "
+        "{axis: [x, y, z], angle: degrees}"
+    }
 
     name: Name = Field(description="name of the link, unique in the scene")
     parent: Name | None = Field(

@@ -17,6 +17,7 @@ from dq_space_arm_env.validation.problems import SceneError, problem_list
 from dq_space_arm_env.validation.yaml_text import YAMLError, parse_yaml, read_yaml, yaml_problem
 
 _SUFFIXES = (".yaml", ".yml")
+_ROBOTS = (".urdf", ".xacro", ".xml")
 
 
 def scenes_directory() -> Traversable:
@@ -56,6 +57,11 @@ def load_scene(source: str | Path | Mapping[str, Any] | Scene) -> Scene:
     """
     if isinstance(source, Scene):
         return _validated(source, f"scene {source.name!r}")
+    if isinstance(source, str | Path) and str(source).lower().endswith(_ROBOTS):
+        raise SceneError(
+            f"{source}: this is a robot's file, not a scene's: `dq-space-arm scenes import FILE --tip LINK` "
+            "makes a scene of it, in Python scene_from_urdf"
+        )
     if isinstance(source, Path) or (isinstance(source, str) and _is_path(source)):
         return _read(Path(source))
     if isinstance(source, Mapping):

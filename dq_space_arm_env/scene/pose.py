@@ -123,7 +123,12 @@ class Pose(Model):
     @model_validator(mode="before")
     @classmethod
     def _accept_dual_quaternion(cls, data: Any) -> Any:
-        if isinstance(data, list | tuple | np.ndarray):
+        if isinstance(data, np.ndarray):
+            data = data.tolist()
+        if isinstance(data, list | tuple):
+            if len(data) != 8:
+                forms = "8 finite numbers, or {position: [x, y, z]} with a rotation if any"
+                raise problem(f"must be {forms}; it has {len(data)}")
             return _position_and_rotation(_read_dual_quaternion(data))
         if not isinstance(data, dict) or "dual_quaternion" not in data:
             return data

@@ -48,7 +48,7 @@ from dq_space_arm_env.scene.simulation import Simulation
 from dq_space_arm_env.scene.thrusters import tank_problems, thruster_problems
 from dq_space_arm_env.scene.wheels import wheel_problems
 from dq_space_arm_env.validation.changes import ChangeError, merged, nested
-from dq_space_arm_env.validation.fields import Name
+from dq_space_arm_env.validation.fields import Name, numbers_of
 from dq_space_arm_env.validation.problems import Model, Problem, SceneError, problem_list, raise_problems
 from dq_space_arm_env.validation.yaml_text import dump_yaml
 
@@ -177,7 +177,7 @@ class Scene(Model):
                 zeros[name] = (0.0,) * length
             elif len(given) != length:
                 problems.append(
-                    Problem((name,), given, f"must be {length} numbers ({why}); it has {len(given)}")
+                    Problem((name,), given, f"must be {numbers_of(length)} ({why}); it has {len(given)}")
                 )
         raise_problems(problems)
         return start.model_copy(update=zeros)
@@ -356,7 +356,7 @@ class Scene(Model):
         limited = [controls[index] for index in previous_controls(self)]
         if given and len(given) != len(limited):
             names = ", ".join(each.name for each in limited) or "nothing limits a control's rate"
-            sentence = f"must be {len(limited)} numbers ({names}); it has {len(given)}"
+            sentence = f"must be {numbers_of(len(limited))} ({names}); it has {len(given)}"
             yield Problem(place, given, sentence)
             return
         for index, value in enumerate(given):

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from dq_space_arm_env.scene.constraints import Direction
-from dq_space_arm_env.validation.fields import Angle, Limit, Positive, Three
+from dq_space_arm_env.validation.fields import Angle, Limit, Positive, Three, numbers_of
 from dq_space_arm_env.validation.problems import Model, Problem, problem
 
 Scene = Any  # `schema.Scene`
@@ -94,7 +94,7 @@ def wheel_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem((*here, "axis"), wheel.axis, 'base.motion is "planar": the axis must be along z')
     given = scene.initial_state.wheel_speeds
     if given and len(given) != len(wheels):
-        sentence = f"must be {len(wheels)} numbers (one per wheel); it has {len(given)}"
+        sentence = f"must be {numbers_of(len(wheels))} (one per wheel); it has {len(given)}"
         yield Problem(("initial_state", "wheel_speeds"), given, sentence)
     for index, wheel in enumerate(wheels):
         fastest = abs(given[index] if index < len(given) else 0.0) + scene.spread.wheel_speeds

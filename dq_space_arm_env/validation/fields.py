@@ -74,6 +74,11 @@ def read_numbers(value: Any, count: int | None = None, span: Range | None = None
     return tuple(numbers)
 
 
+def numbers_of(count: int) -> str:
+    """A count of numbers in words: "1 number", "2 numbers"."""
+    return "1 number" if count == 1 else f"{count} numbers"
+
+
 def _real(value: Any) -> float:
     """Convert a number to float, anything else to NaN."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real):

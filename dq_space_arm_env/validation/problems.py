@@ -73,6 +73,8 @@ class Model(BaseModel):
 
     # Keys that a model's own "before" validator turns into fields.
     _other_keys: ClassVar[tuple[str, ...]] = ()
+    # Keys that are none here, and sentences that say what to give instead.
+    _elsewhere: ClassVar[Mapping[str, str]] = {}
     # Names of the same in other models, by which it may be asked for here.
     _other_words: ClassVar[Mapping[str, str]] = {}
 
@@ -141,13 +143,19 @@ def _sentence(model: type[Model], detail: ErrorDetails) -> str:
         known = [*model.model_fields, *model._other_keys]
         here = f"known keys here: {', '.join(known)}"
         word = str(location[-1])
+        if word in model._elsewhere:
+            return f"unknown key; {model._elsewhere[word]}"
         return f"unknown key; {did_you_mean(model._other_words.get(word, word), known, here)}"
+    if kind == "model_type":
+        needed = [name for name, field in model.model_fields.items() if field.is_required()]
+        values = [yaml_like(detail["input"])] if len(needed) == 1 else ["..."] * len(needed)
+        entries = [f"{name}: {value}" for name, value in zip(needed, values, strict=True)]
+        return f"must be a mapping, as {{{', '.join(entries or ['key: value'])}}}"
     known_sentence = _SENTENCES.get(kind)
     return known_sentence(detail.get("ctx", {})) if known_sentence else detail["msg"]
 
 
 _SENTENCES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
-    "model_type": lambda context: "must be a mapping (key: value)",
     "dict_type": lambda context: "must be a mapping (key: value)",
     "invalid_key": lambda context: "keys must be text",
     "string_type": lambda context: "must be text; quote it if it looks like a number, a date or true/false",

@@ -55,6 +55,11 @@ def test_installed_package_uses_scenes_inside_it(tmp_path: Path, monkeypatch: py
     ("name", "sentence"),
     [
         ("papre", r"no scene is named 'papre'; did you mean 'paper'\? The scenes are approach-corridor, "),
+        (
+            "iiwa.urdf",
+            r"^iiwa\.urdf: this is a robot's file, .* `dq-space-arm scenes import FILE --tip LINK`",
+        ),
+        ("robots/iiwa.urdf.xacro", "makes a scene of it"),
         ("zzz", r"no scene is named 'zzz'; the scenes are .*paper.*ending in \.yaml"),
     ],
 )

@@ -100,7 +100,8 @@ def test_dual_quaternions_within_the_tolerance_are_normalized() -> None:
 @pytest.mark.parametrize(
     ("form", "sentence"),
     [
-        ([1, 0, 0, 0], "must be 8 finite numbers; it has 4"),
+        ([0, 0, 0.6], r"must be 8 finite numbers, or {position: \[x, y, z\]} .*; it has 3"),
+        (np.zeros(7), "8 finite numbers, .*; it has 7"),
         ([2, 0, 0, 0, 0, 0, 0, 0], r"not a unit dual quaternion: \|q_r\| = 2, should be 1"),
         ([1, 0, 0, 0, 3, 0, 0, 0], "not a unit dual quaternion: q_r . q_d = 3, should be 0"),
         ([1, 0, 0, 0, 0, math.nan, 0, 0], "must be 8 finite numbers"),

@@ -33,10 +33,12 @@ REFUSED = [  # path, value, what the sentence says
     ("kk", 3, "kk: unknown key; known keys here: name, description, base"),
     ("bas", 3, "unknown key; did you mean 'base'? Known keys here: name"),
     ("target.pose.dual_quat", [1] * 8, "did you mean 'dual_quaternion'?"),
+    ("links.0.axis", [1, 0, 0], "about the z axis of its frame: turn that with joint.rotation"),
     ("name", "", "must not be empty"),
     ("description", True, "must be text"),
     # containers of the wrong kind
-    ("links.0", [1], "must be a mapping"),
+    ("links.0", [1], "must be a mapping, as {name: ..., mass: ..., "),
+    ("actuators.base_torque", 1.0, "must be a mapping, as {limit: 1.0}"),
     # numbers of the wrong kind
     ("base.mass", "heavy", "finite number greater than 0 (mass of the base, kg)"),
     ("base.mass", True, "finite number greater than 0"),
@@ -113,6 +115,10 @@ def test_one_mistake_gives_one_sentence(
         (
             [("wrist",), ("actuators.wrist_rate",), ("initial_state.wrist_angles", [0, 0, 0])],
             r".*must be 0 numbers \(the scene has no wrist\); it has 3",
+        ),
+        (
+            [("links.1",), ("initial_state.joint_angles", [1, 2])],
+            r".*must be 1 number \(one per link\); it has 2",
         ),
     ],
 )
