@@ -107,7 +107,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         moves = actions
         for step in range(self.repeat):
             observations, rewards, terminated, truncated, info = self.env.step(moves)
-            total = np.where(resting, total, total + weight * rewards if self._sum else rewards)
+            total = np.where(resting, total, total + weight * rewards.astype(float) if self._sum else rewards)
             plain = rewards if self._shaper is None else self._shaper.unshaped
             collected = np.where(resting, collected, collected + plain)
             weight *= self._discount

@@ -319,3 +319,16 @@ def test_success_has_no_reward_where_nothing_tells_it():
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"success_reward: 1.0, should be 0: .* no is_success"):
         env.step(0)
+
+
+def test_rewards_in_single_precision_are_discounted_in_double_precision():
+    def single():
+        shaped = ShapeReward(gymnasium.make("DQSpaceArm-v0", scene=EIGHT_STEPS), 0.1, 0.5)
+        return RepeatAction(shaped, 4, discount=0.9)
+
+    native = vector.ShapeReward(gymnasium.make_vec("DQSpaceArm-v0", 3, scene=EIGHT_STEPS), 0.1, 0.5)
+    native = vector.RepeatAction(native, 4, discount=0.9)
+    for env in (native, sync := SyncVectorEnv([single] * 3)):
+        env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 12)).astype(np.float32)
+    np.testing.assert_array_equal(native.step(actions)[1], sync.step(actions)[1])
