@@ -3,6 +3,7 @@
 import io
 import os
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, NamedTuple
@@ -43,6 +44,8 @@ LEARNERS: Mapping[str, type[BaseAlgorithm]] = {
 }
 TRIAL_ACTIONS = 0.3
 """Standard deviation of the random actions that measure the spread of observations, in action scales."""
+SEED_STRIDE = 2**24
+"""Distance of the copies' seeds in trainings with consecutive seeds: more than there can be copies."""
 
 
 class Trained(NamedTuple):
@@ -91,10 +94,11 @@ def train_learner(
         else:
             model = make_learner(configuration, environment, blank=True)
             before = read_checkpoint(checkpoint, model)
-        model.set_logger(configure(str(folder.path / TENSORBOARD), ["tensorboard"]))
-        callback = watch(before)
-        _learn(model, callback, configuration)
-        policy = callback.export()
+        with closing(configure(str(folder.path / TENSORBOARD), ["tensorboard"])) as logger:  # and its thread
+            model.set_logger(logger)
+            callback = watch(before)
+            _learn(model, callback, configuration)
+            policy = callback.export()
     finally:
         torch.set_num_threads(threads)
         environment.close()
@@ -117,6 +121,8 @@ def _begin(
 ) -> tuple[BaseAlgorithm, Progress]:
     """Make a learner, with demonstrations in its replay buffer where the configuration asks for them."""
     model, algorithm = make_learner(configuration, environment), configuration.algorithm
+    # Stable-Baselines3 seeds copy i with seed + i: trainings with consecutive seeds would share their starts.
+    environment.seed(SEED_STRIDE * configuration.seed)
     solves, seconds = spent_before(configuration.start_from)
     spent = Progress(expert_solves=solves, seconds_before=seconds)
     if not isinstance(algorithm, c.SAC) or algorithm.demonstrations is None:

@@ -5,6 +5,7 @@ import json
 import pickle
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from time import perf_counter
 
@@ -457,6 +458,29 @@ def test_the_same_seed_gives_the_same_agent(scene_file, tmp_path):
     first, second, third = (run.policy.weights[0] for run in (*runs, other))
     np.testing.assert_array_equal(first, second)
     assert np.abs(first - third).max() > 1e-3
+
+
+def test_a_training_leaves_no_thread(scene_file, tmp_path):
+    before = set(threading.enumerate())
+    train(configuration("PPO", scene_file, total_steps=160), tmp_path)
+    assert set(threading.enumerate()) <= before
+
+
+def test_trainings_of_consecutive_seeds_begin_elsewhere(scene_file, tmp_path, monkeypatch):
+    def begin(model, *others):
+        starts.append(model.get_env().reset())
+        raise RuntimeError("begun")
+
+    starts = []
+    monkeypatch.setattr("agents.reinforcement.reinforcement_training._learn", begin)
+    for seed in (0, 1):
+        with pytest.raises(RuntimeError, match="begun"):
+            train(configuration("PPO", scene_file, seed=seed), tmp_path / str(seed))
+    settings = configuration("PPO", scene_file)
+    environment = make_environment(settings, load_scene(scene_file))
+    environment.seed(0)
+    np.testing.assert_array_equal(starts[0], environment.reset())
+    assert not (starts[0][:, None] == starts[1][None]).all(axis=-1).any()
 
 
 @pytest.mark.parametrize("algorithm", ["PPO", "HER"])
