@@ -90,7 +90,7 @@ def suite(
     executor = chosen_executor(workers, ray)
     from agents.suite.entrants import entrant_names
     from agents.suite.running import run_suite
-    from agents.suite.suite_check import check, check_columns, comparable
+    from agents.suite.suite_check import check, check_columns, comparable, fewer_trainings
     from agents.suite.suite_page import suite_page
     from agents.suite.tasks import load_suite
     from dq_space_arm_env.common.progress import ProgressDisplay
@@ -120,6 +120,8 @@ def suite(
     rows = [] if other is None else check(run, other)
     if rows:
         console.print(tabulate(f"Beside {other}", rows, check_columns()).for_terminal())
+    for sentence in fewer_trainings(rows):
+        console.print(sentence, markup=False)
     written.print(page.record)
     is_confirmed = all(row["verdict"] in ("equal", "agrees") for row in rows)
     return SUCCESS if is_confirmed and not run.notes else FAILURE

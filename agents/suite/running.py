@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -93,9 +94,8 @@ def run_suite(
         raise SuiteError(f"{ZOO}: no policy that ships was trained in {', '.join(scenes)}: nobody can fly")
     plans = {(agent, task): chosen.training(agent, task) for agent in agents for task in scenes}
     notes = [*missing_files(files, scenes)]
-    trained = _train(
-        plans, chosen.seeds if seeds is None else seeds, out / TRAININGS, executor, workers, progress, notes
-    )
+    count = chosen.seeds if seeds is None else seeds
+    trained = _train(plans, count, out / TRAININGS, executor, workers, progress, notes)
     scores: list[Score] = []
     for number, task in enumerate(scenes, 1):
 
@@ -103,8 +103,10 @@ def run_suite(
             progress(step._replace(stage=f"{task} ({number} of {len(scenes)}), {step.stage}"))
 
         own = [(agent_name(agent), path) for agent in agents for path in trained[agent, task]]
+        failed = {agent_name(agent): count - len(trained[agent, task]) for agent in agents}
         place, working = out / Path(task).stem, executor or local_executor(workers)
-        scores += _fly(chosen, task, controllers, [*own, *fliers[task]], place, working, trust, announce)
+        flown = _fly(chosen, task, controllers, [*own, *fliers[task]], place, working, trust, announce)
+        scores += (replace(score, failed=failed.get(score.entrant, 0)) for score in flown)
     described = {task: scene.description for task, scene in scenes.items()}
     return SuiteRun(chosen, tuple(scores), described, tuple(notes))
 

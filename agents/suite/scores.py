@@ -24,6 +24,7 @@ class Score:
     condition: str
     entrant: str
     rows: tuple[Row, ...]  # one for each training, from the same starts
+    failed: int = 0  # trainings that gave no policy
 
     @cached_property
     def success_rate(self) -> Interval:
@@ -45,9 +46,12 @@ class Score:
         return performance_profile([row.evaluation.valid_cost_gaps for row in self.rows], gaps)
 
     def solves(self, limits: Limits) -> bool:
-        """Whether the entrant keeps to the limits of the suite; estimates count, not their intervals."""
+        """Whether the entrant keeps to the limits of the suite; estimates count, not their intervals.
+
+        None of its trainings may have failed: the others alone would tell of the lucky ones.
+        """
         violating = None if self.violating is None else self.violating.value
-        return limits.are_kept(self.success_rate.value, violating, self.cost_gap.value)
+        return not self.failed and limits.are_kept(self.success_rate.value, violating, self.cost_gap.value)
 
     def record(self, limits: Limits) -> dict[str, Any]:
         """The score as a row of JSON values."""
@@ -63,6 +67,7 @@ class Score:
             "condition": self.condition,
             "entrant": self.entrant,
             "runs": len(self.rows),
+            "failed_trainings": self.failed,
             "episodes": summaries[0]["episodes"],
             "solved": self.solves(limits),
             "success_rate": list(self.success_rate),

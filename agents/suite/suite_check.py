@@ -21,6 +21,7 @@ from dq_space_arm_env.common.tables import Column, Row
 
 _EQUAL = 1e-9  # relative difference
 _MEASURES = ("success_rate", "violating_episodes", "interquartile_mean_cost_gap")
+_COUNTS = ("runs", "failed_trainings")
 _SAME = {"name", "starts", "receding_starts", "conditions", "limits", "tasks"}
 """What the suites of two runs share, where their scores compare."""
 
@@ -45,7 +46,7 @@ def published(file: str | Path) -> tuple[dict[str, Any], dict[tuple[str, str, st
 
 
 def _checked_key(row: Row) -> tuple[str, str, str]:
-    """Task, condition and entrant of a score, whose measures are intervals; KeyError or TypeError if not."""
+    """Task, condition and entrant of a score; KeyError or TypeError if its measures or counts are none."""
     key = row["task"], row["condition"], row["entrant"]
     if not all(isinstance(part, str) for part in key):
         raise TypeError(f"parts.tasks.scores: {shortened(list(key))}, should be texts")
@@ -55,6 +56,12 @@ def _checked_key(row: Row) -> tuple[str, str, str]:
             raise TypeError(
                 f"{name} of {key[2]} in {key[0]}: {shortened(value)}, should be three numbers, the first "
                 "within the other two"
+            )
+    for name in _COUNTS:
+        count = row.get(name, 0)  # older files lack failed_trainings
+        if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+            raise TypeError(
+                f"{name} of {key[2]} in {key[0]}: {shortened(count)}, should be a whole number, at least 0"
             )
     return key
 
@@ -98,7 +105,8 @@ def comparable(
         if lacking:
             raise SuiteError(f"{file}: {name} flew in {task}, but not under {', '.join(lacking)}")
         success, *others = (None if score.get(key) is None else score[key][0] for key in _MEASURES)
-        is_solved = success is not None and suite.limits.are_kept(success, *others)
+        is_kept = success is not None and suite.limits.are_kept(success, *others)
+        is_solved = is_kept and not score.get("failed_trainings", 0)
         if score.get("solved") is not is_solved:
             wrong = f"solved is {shortened(score.get('solved'))}, should be {is_solved} by its numbers"
             raise SuiteError(f"{file}: {name} in {task}, {condition}: {wrong}")
@@ -110,7 +118,8 @@ def check(run: SuiteRun, file: str | Path) -> list[Row]:
 
     Returns:
         A row for each score that both have: `verdict` is "equal", "agrees" if all 95 % intervals overlap, or
-        "differs". Then a row for each score of these tasks and entrants that the file alone has: "not flown".
+        "differs", as where fewer trainings are left than in the file because some failed. Then a row for each
+        score of these tasks and entrants that the file alone has: "not flown".
 
     Raises:
         SuiteError: If the file is not one, or they have no score in common.
@@ -123,7 +132,9 @@ def check(run: SuiteRun, file: str | Path) -> list[Row]:
             record = score.record(run.suite.limits)
             verdicts = [_verdict(record[name], other.get(name)) for name in _MEASURES]
             worst = max(verdicts, key=("equal", "agrees", "differs").index)
-            found = {f"their_{name}": other.get(name) for name in _MEASURES}
+            if record["failed_trainings"] and record["runs"] < other.get("runs", 0):
+                worst = "differs"
+            found = {f"their_{name}": other.get(name) for name in (*_MEASURES, "runs")}
             rows.append({**record, **found, "verdict": worst})
     if not rows:  # the names fly, each in other tasks
         raise SuiteError(f"{file}: has no score of {', '.join(run.entrants)} in these tasks")
@@ -136,9 +147,17 @@ def _not_flown(run: SuiteRun, theirs: dict[tuple[str, str, str], Row]) -> Iterat
     for key, other in theirs.items():
         task, condition, entrant = key
         if key not in flown and task in run.descriptions and entrant in run.entrants:
-            found = {f"their_{name}": other.get(name) for name in _MEASURES}
+            found = {f"their_{name}": other.get(name) for name in (*_MEASURES, "runs")}
             row = {"task": task, "condition": condition, "entrant": entrant, **found}
-            yield {**row, **dict.fromkeys(_MEASURES), "verdict": "not flown"}
+            yield {**row, **dict.fromkeys((*_MEASURES, "runs")), "verdict": "not flown"}
+
+
+def fewer_trainings(rows: Iterable[Row]) -> Iterator[str]:
+    """A sentence on each entrant of a check that has fewer trainings than in the file, as by `--seeds 1`."""
+    counts = [(row["entrant"], row["runs"], row["their_runs"] or 0) for row in rows if row["runs"]]
+    for entrant, here, there in dict.fromkeys(counts):
+        if here < there:
+            yield f"{entrant}: runs here: {here}, in the file: {there}; intervals of fewer agree with more"
 
 
 def check_columns() -> list[Column]:
@@ -146,6 +165,7 @@ def check_columns() -> list[Column]:
     pairs = [(COLUMNS["success_rate"], "success_rate"), (COLUMNS["violating_episodes"], "violating_episodes")]
     pairs.append((COLUMNS["median_cost_gap"], "interquartile_mean_cost_gap"))
     columns = [Column("task"), Column("condition"), Column("entrant", "")]
+    columns += [Column("their_runs", "runs,\ntheirs"), Column("runs", "runs,\nhere")]
     for column, key in pairs:
         columns.append(replace(column, key=f"their_{key}", heading=f"{column.title}, theirs"))
         columns.append(replace(column, key=key, heading=f"{column.title}, here"))

@@ -41,8 +41,8 @@ def suite_page(run: SuiteRun, *, picture: bool = True) -> Page:
     limits, sections = run.suite.limits, [_together(run, picture), _tasks(run)]
     claim = (
         f"A task is solved where at least {100 * limits.success:g} % of the flights reach the target, at "
-        f"most {100 * limits.violating:g} % violate a constraint, and the cost gap is at most "
-        f"{100 * limits.cost_gap:g} %."
+        f"most {100 * limits.violating:g} % violate a constraint, the cost gap is at most "
+        f"{100 * limits.cost_gap:g} %, and no training failed."
     )
     return Page(run.suite.name, sections, provenance(), claim, "Missing")
 

@@ -19,7 +19,7 @@ from agents.policies.flying import Flights
 from agents.run_folder import DivergedError
 from agents.suite import Score, Suite, SuiteError, SuiteRun, list_suites, load_suite, run_suite
 from agents.suite.entrants import entrant_names, from_files, missing_files
-from agents.suite.suite_check import check, check_columns, comparable
+from agents.suite.suite_check import check, check_columns, comparable, fewer_trainings
 from agents.suite.suite_page import overall_rows, suite_page
 from agents.zoo.finding import PolicyError
 from agents.zoo.shelf import load_policy
@@ -366,6 +366,43 @@ def test_a_check_tells_equal_from_like_and_other(content, tmp_path):
         check(of(fine), file)
 
 
+def test_trainings_that_failed_count(content, tmp_path):
+    suite, file = Suite.model_validate(content), tmp_path / "theirs.json"
+    all_fly = made([[True] * 4] * 3, [[0.0] * 4] * 3)
+    fewer = replace(all_fly, rows=all_fly.rows[:2])
+    some_failed = replace(fewer, failed=1)
+    assert [each.solves(suite.limits) for each in (all_fly, fewer, some_failed)] == [True, True, False]
+
+    def write(score):
+        record = suite_page(SuiteRun(suite, (score,), {"a": ""}, ()), picture=False).record
+        file.write_text(json.dumps(record))
+        return record
+
+    def checked(score):
+        return check(SuiteRun(suite, (score,), {"a": ""}, ()), file)
+
+    write(all_fly)
+    (row,) = checked(some_failed)
+    assert (row["verdict"], row["runs"], row["their_runs"]) == ("differs", 2, 3)
+    rows = checked(fewer)  # as by --seeds 2
+    assert rows[0]["verdict"] == "equal"
+    assert [*fewer_trainings(rows)] == ["x: runs here: 2, in the file: 3; intervals of fewer agree with more"]
+    assert not [*fewer_trainings(checked(all_fly))]
+    record = write(some_failed)
+    assert checked(some_failed)[0]["verdict"] == "equal"
+    (score,) = record["parts"]["tasks"]["scores"]
+    wrong = {0: "solved is False, should be True", "1": "failed_trainings of x in a: '1', should be a whole"}
+    for failed, sentence in wrong.items():
+        score["failed_trainings"] = failed
+        file.write_text(json.dumps(record))
+        with pytest.raises(SuiteError, match=sentence):
+            checked(some_failed)
+    record = write(all_fly)
+    del record["parts"]["tasks"]["scores"][0]["failed_trainings"]  # as in older files
+    file.write_text(json.dumps(record))
+    assert checked(all_fly)[0]["verdict"] == "equal"
+
+
 def test_a_check_that_compares_nothing_is_refused_before_anybody_flies(content, tmp_path, monkeypatch):
     suite, task = Suite.model_validate(content), next(iter(content["tasks"]))
     run = SuiteRun(suite, (made([[True]], [[0.0]], task=task, entrant="mine"),), {task: ""}, ())
@@ -436,7 +473,8 @@ def test_the_verb_writes_page_and_json_and_tells_a_failed_training(content, cach
     monkeypatch.setattr("agents.experiments.training_task.train", diverge)
     assert main(["suite", "tiny", *verb, "--seeds", "2"]) == FAILURE
     record = json.loads((out / "suite.json").read_text())
-    assert [score["runs"] for score in record["parts"]["tasks"]["scores"]] == [1, 1]
+    scores = record["parts"]["tasks"]["scores"]
+    assert [(score["runs"], score["failed_trainings"]) for score in scores] == [(1, 1), (1, 1)]
     assert "The training of tiny-task-1, seed 1, failed: flights cost" in (out / "suite.md").read_text()
     (out / "suite.md").unlink()
     with pytest.raises(SuiteError, match="is not the JSON file of a suite"):  # before anybody flies
