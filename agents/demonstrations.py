@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -62,6 +63,11 @@ def prepare_demonstrations(
 def expert_seconds(demonstrations: Demonstrations) -> float:
     """Processor time that generating a folder of demonstrations took, s; 0 without a log."""
     return math.fsum(read_log(demonstrations).seconds.values())
+
+
+def fingerprint(demonstrations: Demonstrations) -> str:
+    """Hash that identifies a selection of a folder's demonstrations."""
+    return hashlib.sha256(demonstrations.column("index").tobytes()).hexdigest()[:16]
 
 
 def stricter(scene: Scene, scale: float) -> Scene:

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.configuration.imitation import ImitationConfiguration, ObjectiveWeights
+from agents.demonstrations import fingerprint
 from agents.evaluation.statistics import rate_over_runs
-from agents.imitation.cloning import Making, clone, fingerprint
+from agents.imitation.cloning import Making, clone
 from agents.imitation.trainer import Progress
 from agents.run_folder import reserved
 from dq_space_arm_env.common.bounded_reading import parse_json, read_text

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.configuration.imitation import Dagger
-from agents.demonstrations import check_gains
-from agents.imitation.cloning import Cloned, Making, fingerprint
+from agents.demonstrations import check_gains, fingerprint
+from agents.imitation.cloning import Cloned, Making
 from agents.imitation.labels import Solver, label_by_gains
 from agents.imitation.objective import Objective
 from agents.imitation.samples import COLUMNS, Corrections, Mixture, Statistics

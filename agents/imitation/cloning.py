@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ import torch
 
 from agents.configuration.imitation import Cloning, Fit
 from agents.configuration.schema import Network
-from agents.demonstrations import check_gains, check_scene
+from agents.demonstrations import check_gains, check_scene, fingerprint
 from agents.imitation.objective import Objective
 from agents.imitation.samples import Statistics
 from agents.imitation.trainer import N, Progress, Record, Trainer, Watch, torch_threads
@@ -135,11 +134,6 @@ def facts_of(demonstrations: Demonstrations, settings: Fit, making: Making, scen
             **settings.model_dump(mode="json"),
         },
     }
-
-
-def fingerprint(demonstrations: Demonstrations) -> str:
-    """Hash that identifies a selection of a folder's demonstrations."""
-    return hashlib.sha256(demonstrations.column("index").tobytes()).hexdigest()[:16]
 
 
 def divide(

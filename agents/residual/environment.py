@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from agents.configuration.schema import Mismatch
+from agents.demonstrations import fingerprint
 from agents.evaluation.plans import FloatArray, Followed, Plans
 from agents.residual.corrections import CorrectionObserver, corrected
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
@@ -70,6 +71,7 @@ class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any
         # The corrected flights and, after them, their twins: one batch is faster.
         self._factors = np.tile(np.resize(np.array(mismatch.mass_factors), copies), 2)
         self._worlds = DQSpaceArmVectorEnv(2 * copies, with_loads(scene, self._factors)[0])
+        self._origin = f"{demonstrations.manifest['settings_sha256']} {fingerprint(demonstrations)}"
         self._plans, self._scene, self._mismatch = Plans.of(demonstrations), scene, mismatch
         self._scale, self._power = np.asarray(action_scale, dtype=np.float64), cost_power
         self._observer = CorrectionObserver(scene, memory, full_authority)
@@ -135,6 +137,7 @@ class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any
             Arrays by name.
         """
         own = {
+            "plans": self._origin,
             "chosen": self._plans.chosen,
             "noise": self._noise,
             "push": self._push,
@@ -157,8 +160,11 @@ class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any
 
         Raises:
             KeyError: If an array is missing.
-            ValueError: If an array has a wrong shape or type.
+            ValueError: If an array has a wrong shape or type, or the state is of episodes with other plans.
         """
+        origin = str(state.get("plans", self._origin))  # earlier states do not tell
+        if origin != self._origin:
+            raise ValueError(f"plans: of demonstrations {origin}, should be of those given, {self._origin}")
         prefix = "worlds."
         self._worlds.set_state(
             {name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)}

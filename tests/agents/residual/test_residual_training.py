@@ -19,7 +19,7 @@ from agents.reinforcement.networks import export_policy
 from agents.reinforcement.reinforcement_training import make_learner
 from agents.residual.corrections import CorrectionObserver, correcting, correction
 from agents.residual.mismatch import Worlds, fly_mismatched
-from agents.residual.residual_training import make_residual_environment, silence, train_residual
+from agents.residual.residual_training import make_residual_environment, silence, split, train_residual
 from agents.run_folder import RunFolder, RunFolderError
 from dq_space_arm_env import compile_scene
 from experts.demonstrations import DemonstrationsError
@@ -186,6 +186,21 @@ def test_a_divergence_after_resuming_is_followed_as_without(configuration, small
         np.testing.assert_array_equal(seen, expected)
 
 
+def test_episodes_go_on_with_their_plans_alone(configuration, small_scene, demonstrations):
+    """Others have the same shapes and numbers."""
+    own, others = (
+        make_residual_environment(configuration(), small_scene, each)
+        for each in (demonstrations[:3], demonstrations[3:6])
+    )
+    own.reset()
+    others.reset()
+    state = own.get_state()
+    with pytest.raises(ValueError, match=r"plans: of demonstrations .*, should be of those given"):
+        others.set_state(state)
+    del state["plans"]  # as in earlier checkpoints
+    own.set_state(state)
+
+
 @pytest.mark.parametrize("name", ["demonstrations", "drawn"])
 def test_the_environment_and_the_controller_see_and_do_the_same(name, configuration, request):
     """A policy that corrects by what it sees costs the same in both, also where targets are drawn."""
@@ -221,7 +236,8 @@ def test_it_trains_exports_and_resumes(algorithm, configuration, small_scene, de
     with pytest.raises(KeyboardInterrupt):
         train_residual(settings, tmp_path, report=kill)
     checkpoint = RunFolder(tmp_path, settings).checkpoint()
-    environment = make_residual_environment(settings, small_scene, demonstrations)
+    practiced, _ = split(demonstrations, settings.schedule.evaluation_episodes)
+    environment = make_residual_environment(settings, small_scene, practiced)
     model = make_learner(settings.learner(), environment, blank=True)
     progress = read_checkpoint(checkpoint, model)
     assert progress.environment_steps == model.num_timesteps * REPEAT == 2400
