@@ -75,7 +75,7 @@ def train_by_gradients(
     """Train an agent in a run folder, resuming from its last checkpoint."""
     scene = load_scene(configuration.scene)
     folder = RunFolder(Path(out), configuration)
-    learner = _Learner(configuration, scene)
+    learner = _Learner(configuration, scene, blank=folder.checkpoint() is not None)
     learner.resume(folder)
     # On small matrices several threads wait for each other.
     with threadpool_limits(configuration.threads, user_api="blas"):
@@ -94,9 +94,12 @@ def coarser(scene: Scene) -> Scene:
 
 
 class _Learner:
-    """The network, its episodes and its optimizer."""
+    """The network, its episodes and its optimizer.
 
-    def __init__(self, configuration: GradientConfiguration, scene: Scene) -> None:
+    A blank one, whose weights and units a checkpoint is to replace, does not need the policy of `start_from`.
+    """
+
+    def __init__(self, configuration: GradientConfiguration, scene: Scene, *, blank: bool = False) -> None:
         self._settings, self._configuration, self._scene = configuration.algorithm, configuration, scene
         settings, rng = configuration.algorithm, np.random.default_rng(configuration.seed)
         self._times = decision_times(scene, settings.decisions, settings.crowding)
@@ -106,8 +109,9 @@ class _Learner:
         self._mean, self._scale, units = first_units(scene, self._times, rng, configuration.seed)
         sizes = [len(self._mean), *configuration.network.hidden, StateLayout.of(scene).n_u]
         self._weights = random_weights(sizes, rng)
-        start = load_start(configuration.start_from, configuration.network, sizes[0], sizes[-1])
-        self._begin_with(start, units)
+        given = None if blank else configuration.start_from
+        self._before = spent_before(given)
+        self._begin_with(load_start(given, configuration.network, sizes[0], sizes[-1]), units)
         self._episodes = self._begin_episodes(units)
         constrained = self._episodes.penalties.is_constrained
         self._every_step_from = math.ceil(EVERY_STEP * settings.updates) if constrained else math.inf
@@ -140,7 +144,6 @@ class _Learner:
 
     def _begin_with(self, policy: ExportedPolicy | None, units: Array) -> None:
         """Take the weights of a policy, and its units; outputs have some of their own."""
-        self._before = spent_before(self._configuration.start_from)
         if policy is None:
             return
         self._mean, self._scale = policy.mean, policy.scale
@@ -309,6 +312,7 @@ class _Learner:
         """The arrays of a checkpoint by name."""
         arrays = {**self._state(), **self._fallback.arrays(), "seconds": np.array(self._seconds)}
         arrays |= {"mean": self._mean, "scale": self._scale, "substeps": self._episodes.substeps}
+        arrays["expert_solves"], arrays["seconds_before"] = map(np.array, self._before)
         arrays["cost"] = np.array(self._episodes.penalties.cost)
         arrays["roughness"] = np.array(self._episodes.roughness)
         return arrays
@@ -336,7 +340,12 @@ class _Learner:
             self._seconds = float(arrays["seconds"])
             self._mean, self._scale = arrays["mean"], arrays["scale"]
             self._episodes.penalties.cost = float(arrays["cost"])
+            tells = "expert_solves" in arrays
+            if tells:
+                self._before = int(arrays["expert_solves"]), float(arrays["seconds_before"])
         except (KeyError, ValueError, OSError, UnreadableError) as error:
             raise RunFolderError(
                 f"{place} cannot be read ({error}); remove it to restart the training"
             ) from error
+        if not tells:  # an earlier one
+            self._before = spent_before(self._configuration.start_from)

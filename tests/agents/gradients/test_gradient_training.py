@@ -1,6 +1,7 @@
 """Training by analytic policy gradients: its rules, its constraints, and that it resumes to the bit."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,8 +122,8 @@ def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene
     assert len(trained_curve(tmp_path / "halves")) == 4
 
 
-def resume_after(updates, configuration, folder, monkeypatch):
-    """Train with an interruption."""
+def resume_after(updates, configuration, folder, monkeypatch, meanwhile=lambda: None):
+    """Train with an interruption, during which something happens."""
 
     class StopError(Exception):
         """As if the process were killed."""
@@ -139,6 +140,7 @@ def resume_after(updates, configuration, folder, monkeypatch):
     with pytest.raises(StopError):
         train_by_gradients(configuration, folder)
     monkeypatch.setattr(gradient_training._Learner, "_update", update)
+    meanwhile()
     return train_by_gradients(configuration, folder)
 
 
@@ -330,6 +332,30 @@ def test_training_starts_from_a_policy(small_file, tmp_path):
     wider = {**start, "network": Network(hidden=[8])}
     with pytest.raises(ConfigurationError, match=r"start_from: .* not fit: network.hidden is \[16, 16\]"):
         train_by_gradients(settings(small_file).model_copy(update=wider), tmp_path / "third")
+
+
+def test_a_training_goes_on_without_the_policy_that_it_started_from(small_file, tmp_path, monkeypatch):
+    first = train_by_gradients(settings(small_file, updates=3), tmp_path / "first").policy
+    taken = {"seconds": 1000.0, "expert_solves": 7}
+    start = tmp_path / "start.npz"
+    replace(first, metadata={"training": taken}).save(start)
+    longer = settings(small_file, updates=70).model_copy(update={"start_from": str(start)})
+    whole = train_by_gradients(longer, tmp_path / "whole").policy
+    halves = tmp_path / "halves"
+    resumed = resume_after(65, longer, halves, monkeypatch, start.unlink).policy
+    for one, other in zip(whole.weights, resumed.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    noted = resumed.metadata["training"]
+    assert noted["seconds"] > taken["seconds"]
+    assert noted["expert_solves"] == 7
+    (checkpoint,) = (halves / "checkpoints").glob("*/checkpoint.npz")
+    with np.load(checkpoint) as found:  # as earlier ones were
+        np.savez(checkpoint, **{name: found[name] for name in found.files if name != "expert_solves"})
+    with pytest.raises(ConfigurationError, match=r"start_from: .*start\.npz"):
+        train_by_gradients(longer, halves)
+    replace(first, metadata={"training": taken}).save(start)
+    again = train_by_gradients(longer, halves).policy
+    assert again.metadata["training"]["expert_solves"] == 7
 
 
 def test_normalization_is_that_of_the_checkpoint(small_file, tmp_path, monkeypatch):
