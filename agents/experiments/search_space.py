@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, ValidationError
 
 from agents.configuration import AgentConfiguration, ConfigurationError, load_configuration
+from agents.configuration.residual import ResidualConfiguration
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.validation import (
@@ -27,8 +28,9 @@ from dq_space_arm_env.validation import (
 from dq_space_arm_env.validation.changes import ChangeError, merged, nested
 
 _IDENTITY = ("name", "description", "scene", "seed", "threads")
-"""Keys of a configuration that are no hyperparameters."""
-
+"""Keys of a configuration that are no hyperparameters; nor are seeds of its parts."""
+_JUDGING = ("curve", "progression", "schedule")
+"""Parts of a configuration that say how long trials may learn, and which flights they are judged by."""
 
 _BETWEEN = 0.5 * (5.0**0.5 - 1.0)  # place in a range whose value is hardly ever a whole number
 
@@ -99,8 +101,8 @@ def load_search_space(path: str | Path, configuration: AgentConfiguration) -> Se
         The space.
 
     Raises:
-        ConfigurationError: If it cannot be read, a key is no hyperparameter of the configuration or part of
-            another, or one of its values is not allowed there.
+        ConfigurationError: If it cannot be read, a key is no hyperparameter of the configuration, says how
+            trials are judged, or is part of another, or one of its values is not allowed there.
     """
     try:
         space = SearchSpace.model_validate(mapping_at_top(path, read_yaml(path)))
@@ -111,7 +113,14 @@ def load_search_space(path: str | Path, configuration: AgentConfiguration) -> Se
     except ValidationError as error:
         raise ConfigurationError(problem_list(str(path), error)) from error
     for key, parameter in space.search.items():
-        if key.partition(".")[0] in _IDENTITY:
+        part, last = key.partition(".")[0], key.rpartition(".")[2]
+        is_residual = isinstance(configuration, ResidualConfiguration)  # whose mismatch its flights meet
+        if part in _JUDGING or (part == "mismatch" and is_residual):
+            raise ConfigurationError(
+                f"{path}: search.{key}: {part} says how trials are judged, and has to be the same for all: "
+                "leave it out"
+            )
+        if part in _IDENTITY or last == "seed":
             raise ConfigurationError(f"{path}: search.{key}: {key} is no hyperparameter: leave it out")
         for other in space.search:
             if other.startswith(f"{key}."):

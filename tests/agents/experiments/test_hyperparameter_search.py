@@ -11,6 +11,7 @@ pytest.importorskip("threadpoolctl")
 
 from agents.command_line.search import search as search_verb
 from agents.configuration import AgentConfiguration, ConfigurationError, load_configuration
+from agents.configuration.gradients import FlightMismatch
 from agents.experiments.hyperparameter_search import JOURNAL, score, search
 from agents.experiments.search_space import SearchSpace, load_search_space, with_values
 from agents.experiments.training_task import PRUNE
@@ -265,6 +266,13 @@ def test_a_trial_that_was_given_up_is_not_where_nothing_is(
         ("{network.hidden: {choices: [[8], [9]], low: 1}}", "must stand alone"),
         ("{network.activation: {choices: [tanh, 2020-01-01]}}", r"network.activation: the value .*2020"),
         ("{seed: {low: 0, high: 9}}", "search.seed: seed is no hyperparameter: leave it out"),
+        ("{demonstrations.seed: {low: 0, high: 9}}", "demonstrations.seed is no hyperparameter"),
+        (
+            "{progression.evaluation_episodes: {low: 1, high: 9}}",
+            "search.progression.evaluation_episodes: progression says how trials are judged, and has to be",
+        ),
+        ("{schedule.total_steps: {low: 1, high: 9}}", "schedule says how trials are judged"),
+        ("{curve: {choices: [{episodes: 1}, {episodes: 9}]}}", "curve says how trials are judged"),
         ("{}", "search"),
         ("3", "search = 3: must be a mapping"),
     ],
@@ -280,6 +288,18 @@ def test_wrong_spaces_are_named(
     path.write_text("[search]\n")
     with pytest.raises(ConfigurationError, match=r"space\.yaml: must be a mapping"):
         load_search_space(path, configuration)
+
+
+def test_the_mismatch_of_flights_that_judge_is_no_hyperparameter(
+    configuration: AgentConfiguration, tmp_path: Path
+) -> None:
+    path = tmp_path / "space.yaml"
+    path.write_text("search: {mismatch.push: {low: 0.0, high: 0.1}}\n")
+    content = {"name": "corrections", "algorithm": {"name": "residual-PPO"}, "schedule": {"total_steps": 1}}
+    with pytest.raises(ConfigurationError, match=r"mismatch\.push: mismatch says how trials are judged"):
+        load_search_space(path, load_configuration(content))
+    disturbed = configuration.model_copy(update={"mismatch": FlightMismatch()})  # its flights meet none
+    assert "mismatch.push" in load_search_space(path, disturbed).search
 
 
 def test_values_go_where_their_keys_point(configuration: AgentConfiguration) -> None:
