@@ -21,7 +21,13 @@ from agents.evaluation.expert_costs import (
     evaluation_seeds,
     optimal_costs,
 )
-from agents.evaluation.statistics import Interval, bootstrap_interval, rate_over_runs, wilson_interval
+from agents.evaluation.statistics import (
+    Interval,
+    bootstrap_interval,
+    percentiles,
+    rate_over_runs,
+    wilson_interval,
+)
 from agents.policies.flying import Flights, Policy, fly, from_json_list, json_list, time_per_action
 from agents.policies.policy_files import noted_effort
 from agents.zoo.finding import as_policy, check_fit
@@ -113,7 +119,7 @@ class Evaluation:
     def tail_cost_gap(self) -> Interval:
         """95th percentile of the known cost gaps, with a bootstrap interval."""
         return bootstrap_interval(
-            self._known_gaps, lambda gaps: float(np.percentile(gaps, TAIL)), share=TAIL / 100.0
+            self._known_gaps, lambda gaps: float(percentiles(gaps, TAIL)), share=TAIL / 100.0
         )
 
     @cached_property

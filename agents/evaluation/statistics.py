@@ -76,8 +76,18 @@ def bootstrap_interval(
     rng = np.random.default_rng(seed)
     resamples = [statistic(sample[rng.integers(len(sample), size=len(sample))]) for _ in range(RESAMPLES)]
     tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(resamples, [tail, 100.0 - tail])
+    low, high = percentiles(resamples, [tail, 100.0 - tail])
     return Interval(statistic(sample), float(low), float(high))
+
+
+def percentiles(values: ArrayLike, shares: ArrayLike) -> FloatArray:
+    """Percentiles of values, some of which may be infinite, by their shares [%]; NaN where one is NaN."""
+    sample, asked = (np.asarray(each, dtype=np.float64) for each in (values, shares))
+    with np.errstate(invalid="ignore"):  # of interpolations from or to an infinite value
+        found = np.asarray(np.percentile(sample, asked))
+    if np.isnan(found).any():
+        found = np.where(np.isnan(found), np.percentile(sample, asked, method="higher"), found)
+    return found
 
 
 def fewest_values(share: float) -> int:
@@ -144,6 +154,8 @@ def compare_runs(successes: Sequence[ArrayLike], gaps: Sequence[ArrayLike]) -> R
 def gap_over_runs(gaps: Sequence[ArrayLike]) -> Interval:
     """Interquartile mean of cost gaps over runs and starts, with an interval for other runs and starts.
 
+    Where it is infinite, the bounds are NaN.
+
     Args:
         gaps: Cost gaps of each run, shape (n,), the same starts in all runs; NaN where unknown.
 
@@ -155,9 +167,14 @@ def gap_over_runs(gaps: Sequence[ArrayLike]) -> Interval:
         return Interval(math.nan, math.nan, math.nan)
     # The variance of a trimmed mean is that of its winsorized values (Tukey and McLaughlin, Sankhya 1963).
     middle = interquartile_mean(gap)
-    if gap.size == 1:
+    if gap.size == 1 or not math.isfinite(middle):
         return Interval(middle, math.nan, math.nan)
-    _, variance, quantile = _crossed(2.0 * np.clip(gap, *np.quantile(gap, [0.25, 0.75])))
+    if np.isfinite(gap).all():
+        low, high = np.quantile(gap, [0.25, 0.75])
+    else:  # those between an infinite gap and another are infinite
+        ordered, cut = np.sort(gap, axis=None), gap.size // 4
+        low, high = ordered[cut], ordered[gap.size - 1 - cut]
+    _, variance, quantile = _crossed(2.0 * np.clip(gap, low, high))
     half = quantile * math.sqrt(variance)
     return Interval(middle, middle - half, middle + half)
 

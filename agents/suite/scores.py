@@ -11,8 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agents.evaluation.comparing import Row
-from agents.evaluation.evaluating import known_interval
-from agents.evaluation.statistics import Interval, gap_over_runs, performance_profile, rate_over_runs
+from agents.evaluation.evaluating import TAIL, known_interval
+from agents.evaluation.statistics import (
+    Interval,
+    gap_over_runs,
+    percentiles,
+    performance_profile,
+    rate_over_runs,
+)
 from agents.suite.tasks import Limits, Suite
 
 
@@ -61,7 +67,8 @@ class Score:
             known = [each[name] for each in summaries if each[name] is not None]
             return float(np.mean(known)) if known else None
 
-        tails = np.concatenate([row.evaluation.cost_gaps for row in self.rows])
+        gaps = np.concatenate([row.evaluation.cost_gaps for row in self.rows])
+        known = gaps[~np.isnan(gaps)]
         return {
             "task": self.task,
             "condition": self.condition,
@@ -72,7 +79,7 @@ class Score:
             "solved": self.solves(limits),
             "success_rate": list(self.success_rate),
             "interquartile_mean_cost_gap": known_interval(self.cost_gap),
-            "tail": None if np.isnan(tails).all() else float(np.nanpercentile(tails, 95.0)),
+            "tail": float(percentiles(known, TAIL)) if known.size else None,
             "unknown_optima": summaries[0]["unknown_optima"],  # starts that gaps and profiles leave out
             "violating_episodes": None if self.violating is None else list(self.violating),
             "action_seconds": float(np.median([each["action_seconds"] for each in summaries])),

@@ -16,7 +16,7 @@ from agents.evaluation import (
     rate_over_runs,
     wilson_interval,
 )
-from agents.evaluation.statistics import fewest_values, gap_over_runs, student_quantile
+from agents.evaluation.statistics import fewest_values, gap_over_runs, percentiles, student_quantile
 
 
 def test_wilsons_interval_of_a_half():
@@ -172,6 +172,23 @@ def test_a_single_value_tells_no_interval():
     for found in (bootstrap_interval([0.2], np.median), *map(gap_over_runs, ([[0.2]], [[math.nan, 0.2]]))):
         assert found == unknown
     assert gap_over_runs([[0.2], [0.3]]).low < 0.2
+
+
+@pytest.mark.filterwarnings("error")
+def test_infinite_gaps_have_no_interval_that_is_no_number():
+    """As of flights that diverge; two of eight are beyond the middle half."""
+    few, many = np.array([0.1, 0.2, 0.3, 0.4, 0.2, 0.3, np.inf, np.inf]), np.full(8, np.inf)
+    found = gap_over_runs([few])
+    assert found.value == pytest.approx(0.3)
+    assert 0.1 < found.low < 0.3 < found.high < 0.5
+    assert gap_over_runs([few, many]) == pytest.approx((math.inf, math.nan, math.nan), nan_ok=True)
+    median = bootstrap_interval(few, lambda sample: float(np.median(sample)))
+    assert (median.value, median.high) == (pytest.approx(0.3), math.inf)
+    assert 0.1 <= median.low <= 0.3
+    tail = bootstrap_interval(np.repeat(few, 8), lambda each: float(percentiles(each, 95.0)), share=0.95)
+    assert tail == (math.inf, math.inf, math.inf)
+    np.testing.assert_array_equal(percentiles([0.0, 1.0, 2.0, np.inf, np.inf], [50, 75]), [2.0, np.inf])
+    assert math.isnan(percentiles([0.0, math.nan], 50.0))
 
 
 def test_values_whose_range_holds_a_quantile_too_rarely_tell_no_interval():
