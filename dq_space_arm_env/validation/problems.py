@@ -95,8 +95,11 @@ class Model(BaseModel):
 
 def _rethrow(model: type[Model], error: ValidationError) -> NoReturn:
     """Raise the same errors, worded as "path = value: what would be right"."""
-    explained = []
-    for detail in error.errors(include_url=False):
+    explained, found = [], error.errors(include_url=False)
+    around = {each["loc"][:end] for each in found for end in range(len(each["loc"]))}
+    for detail in found:
+        if detail["type"] == "too_short" and detail["loc"] in around:
+            continue  # without its wrong items, which are named
         location = _without_tag(model, detail["loc"])
         if detail["type"] == _KIND:
             sentence = detail["ctx"]["sentence"]

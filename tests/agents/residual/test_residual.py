@@ -430,6 +430,8 @@ MINIMAL = {"name": "small", "algorithm": {"name": "residual-PPO"}, "schedule": {
         ({"environment": {"copies": 2}}, "must be at least 5, one for each mass factor"),
         ({"environment": {"copies": 20}}, "batch_size = 4096: must be at most 1,000"),
         ({"algorithm": {"name": "residual-TD3"}}, "TD3, APG, cloning, dagger, act, residual-PPO"),
+        ({"mismatch": {"mass_factors": ["0.7"]}}, "1 problem\n  - mismatch.mass_factors[0] = '0.7': must"),
+        ({"mismatch": {"mass_factors": []}}, "1 problem\n  - mismatch.mass_factors = []: Tuple should have"),
         ({"algorithm": {"name": "residual-SAC", "hindsight": {}}}, "must be left out"),
         (
             {"algorithm": {"name": "residual-PPO", "lagrangian": {}}},
