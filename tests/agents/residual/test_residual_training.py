@@ -130,7 +130,7 @@ def test_rewards_are_what_corrections_save(unscaled, small_scene):
 def test_a_flight_that_diverges_is_charged_for_the_rest(unscaled, small_scene):
     worlds = unscaled.vector_env.unwrapped._worlds
     push = np.zeros((2 * COPIES, worlds.kernels.n_t))
-    push[0, worlds.kernels.layout.tangent.base_velocity] = 1e9
+    push[0, worlds.kernels.layout.tangent.base_velocity] = 2e5
     worlds.perturb(push)
     total, idle = np.zeros(COPIES), np.zeros((COPIES, worlds.kernels.n_u))
     for _ in range(small_scene.simulation.steps // REPEAT):
@@ -153,7 +153,7 @@ def test_what_follows_a_divergence_depends_on_the_seed_alone(configuration, smal
         environment.reset()
         worlds = environment.vector_env.unwrapped._worlds
         push = np.zeros((2 * COPIES, worlds.kernels.n_t))
-        push[0, worlds.kernels.layout.tangent.base_velocity] = 1e9
+        push[0, worlds.kernels.layout.tangent.base_velocity] = 2e5
         worlds.perturb(push)
         idle = np.zeros((COPIES, worlds.kernels.n_u))
         return [environment.step(idle)[0][0] for _ in range(2)]
@@ -172,7 +172,7 @@ def test_a_divergence_after_resuming_is_followed_as_without(configuration, small
     def lose_one(environment):
         worlds = environment.vector_env.unwrapped._worlds
         push = np.zeros((2 * COPIES, worlds.kernels.n_t))
-        push[0, worlds.kernels.layout.tangent.base_velocity] = 1e9
+        push[0, worlds.kernels.layout.tangent.base_velocity] = 2e5
         worlds.perturb(push)
 
     lose_one(whole)
