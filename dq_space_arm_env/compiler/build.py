@@ -53,11 +53,7 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     they read and write the same values as the lane that owns the row.
     """
     sizes, zeroed = program.scratch_sizes(), program.read_before_written()
-    functions: dict[str, ir.Function] = {}
-    for call in program.calls:
-        if call.graph.name not in functions:
-            functions[call.graph.name] = emit_graph(module, call.graph, target)
-
+    functions = {name: emit_graph(module, graph, target) for name, graph in program.graphs().items()}
     kernel = ir.Function(module, ir.FunctionType(ir.VoidType(), [INDEX, INDEX, POINTER]), program.name)
     begin, end, addresses = kernel.args
     entry = kernel.append_basic_block("entry")

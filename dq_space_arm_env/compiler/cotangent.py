@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dq_space_arm_env.compiler.forward_mode import COEFFICIENTS, dependencies
-from dq_space_arm_env.compiler.graph import Graph, trace
+from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Call, Program
 from dq_space_arm_env.compiler.reverse_mode import COTANGENT, CotangentGraphs, cotangent_graphs
 from dq_space_arm_env.compiler.tangent import bound, reached
@@ -93,17 +93,16 @@ class _Transformation:
 
     def _cotangent_graphs(self) -> dict[str, CotangentGraphs]:
         """Cotangents by name of the graph, for whatever any of its calls needs."""
-        graphs: dict[str, Graph] = {}
+        graphs = self._program.graphs()
         inputs: dict[str, set[str]] = {}
         outputs: dict[str, set[str]] = {}
         for call in filter(self._is_live, self._calls):
             read, written = self._live_names(call)
-            graphs[call.graph.name] = call.graph
             inputs.setdefault(call.graph.name, set()).update(read)
             outputs.setdefault(call.graph.name, set()).update(written)
         return {
-            name: cotangent_graphs(graph, sorted(outputs[name]), sorted(inputs[name]))
-            for name, graph in graphs.items()
+            name: cotangent_graphs(graphs[name], sorted(outputs[name]), sorted(inputs[name]))
+            for name in inputs
         }
 
     def _coefficients(self, number: int, call: Call) -> dict[str, str]:

@@ -158,6 +158,19 @@ class Program:
             call.graph.operation_count for number, call in enumerate(self.calls) if number not in guarded
         )
 
+    def graphs(self) -> dict[str, Graph]:
+        """Graphs by name: calls of one name run one function; ValueError if they have several graphs."""
+        found: dict[str, Graph] = {}
+        for call in self.calls:
+            known = found.setdefault(call.graph.name, call.graph)
+            # Numbers of graphs may be NaN, which equals nothing.
+            if known is not call.graph and repr(known) != repr(call.graph):
+                raise ValueError(
+                    f"program {self.name!r}: calls of two graphs named {call.graph.name!r}, should have "
+                    "names of their own"
+                )
+        return found
+
     def scratch_sizes(self) -> dict[str, int]:
         """Number of vectors of every buffer, scratch included; ValueError if two calls disagree."""
         sizes = {buffer.name: buffer.size for buffer in (*self.inputs, *self.outputs)}

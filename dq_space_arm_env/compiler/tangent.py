@@ -105,7 +105,7 @@ class _Transformation:
         self._program, self._by = program, by
         self._sizes = program.scratch_sizes()
         self._check(of)
-        self._dependencies = {call.graph.name: dependencies(call.graph) for call in program.calls}
+        self._dependencies = {name: dependencies(graph) for name, graph in program.graphs().items()}
         self._live = self._active() & self._needed(of)
         self._graphs = self._tangent_graphs()
         self._count = sum(self._sizes[name] for name in by)
@@ -164,19 +164,17 @@ class _Transformation:
 
     def _tangent_graphs(self) -> dict[str, TangentGraphs]:
         """Tangents by name of the graph, for whatever any of its calls needs."""
-        graphs: dict[str, Graph] = {}
+        graphs = self._program.graphs()
         inputs: dict[str, set[str]] = {}
         outputs: dict[str, set[str]] = {}
         for call in self._program.calls:
             name = call.graph.name
             read, written = self._live_names(call)
             if read and written:
-                graphs[name] = call.graph
                 inputs.setdefault(name, set()).update(read)
                 outputs.setdefault(name, set()).update(written)
         return {
-            name: tangent_graphs(graph, sorted(inputs[name]), sorted(outputs[name]))
-            for name, graph in graphs.items()
+            name: tangent_graphs(graphs[name], sorted(inputs[name]), sorted(outputs[name])) for name in inputs
         }
 
     def _live_names(self, call: Call) -> tuple[list[str], list[str]]:

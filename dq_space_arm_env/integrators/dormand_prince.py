@@ -46,7 +46,7 @@ class DormandPrince:
 
     def append_step(self, program: Program, field: VectorField) -> None:
         attempts = _Attempts(field)
-        substeps = self._begun(program, attempts)
+        substeps = self._begun(program, attempts, attempts.prefix)
         attempts.stages.append_first(program)
         with program.repeated_while("unfinished"):
             substeps.append_length(program)
@@ -57,7 +57,8 @@ class DormandPrince:
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         attempts = _Attempts(field)
-        substeps = self._begun(program, attempts)
+        # A step may stand before in the program, whose graphs have other names.
+        substeps = self._begun(program, attempts, f"{attempts.prefix}_linearized")
         attempts.stages.append_linearized_first(program)
         names = {"state": "state_tried", "y1": "y7", "k1": "k7", "Y1": "Y7", "K1": "K7"}
         if field.pose is not None:
@@ -71,11 +72,11 @@ class DormandPrince:
             substeps.append_choice(program, names)
         return attempts.append_linearized_end(program)
 
-    def _begun(self, program: Program, attempts: _Attempts) -> Substeps:
-        """Begin a step."""
+    def _begun(self, program: Program, attempts: _Attempts, prefix: str) -> Substeps:
+        """Begin a step, whose substeps' graphs have names with a prefix."""
         tolerances = {"tolerances": [self.rtol, self.atol]}
         program.call(trace(f"{attempts.prefix}_tolerances", {}, lambda: tolerances))
-        substeps = Substeps(attempts.prefix, fifth_root, MOST_SUBSTEPS)
+        substeps = Substeps(prefix, fifth_root, MOST_SUBSTEPS)
         substeps.append_begin(program, state="x")
         return substeps
 

@@ -11,8 +11,10 @@ from graph_interpreter import evaluate_graph
 
 from dq_space_arm_env.compiler import emit, native
 from dq_space_arm_env.compiler.build import assembly, build_program
+from dq_space_arm_env.compiler.cotangent import append_cotangents
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.compiler.tangent import append_tangents
 
 LANES = (1, native.host_machine().lanes)
 EPS = np.finfo(float).eps
@@ -247,6 +249,26 @@ def test_calls_share_code_and_scratch_starts_as_zero():
         np.testing.assert_array_equal(y, 2 * x)
     assert program.operation_count == 2
     assert assembly(program, 1).count("define internal") == 1
+
+
+def test_one_graph_traced_twice_is_compiled_once():
+    program = Program("program", [Buffer("x", 1)], [Buffer("c", 1)])
+    for source, target in (("x", "b"), ("b", "c")):
+        graph = trace("kept", {"a": 1}, lambda a: {"kept": [casadi.if_else(a[0] > 0.0, a[0], np.nan)]})
+        program.call(graph, a=source, kept=target)
+    assert assembly(program, 1).count("define internal") == 1
+
+
+@pytest.mark.parametrize("use", [build_program, append_tangents, append_cotangents])
+def test_calls_of_two_graphs_of_one_name_are_refused(use):
+    """The function of a name is that of its first graph, so the second would compute what the first does."""
+    program = Program("program", [Buffer("x", 1)], [Buffer("y", 1)])
+    for factor, source, target in ((2.0, "x", "a"), (2.0, "a", "b"), (3.0, "b", "y")):
+        graph = trace("scaled", {"x": 1}, lambda x, factor=factor: {"y": [factor * x[0]]})
+        program.call(graph, x=source, y=target)
+    given = {build_program: [1], append_tangents: [["x"], ["y"]], append_cotangents: [{"y": "x"}, ["x"]]}
+    with pytest.raises(ValueError, match="calls of two graphs named 'scaled', should have"):
+        use(program, *given[use])
 
 
 def test_programs_that_need_more_memory_than_a_small_stack_run_on_it():

@@ -128,6 +128,27 @@ def test_derivatives_over_many_shares_agree_with_differences(scene):
     np.testing.assert_allclose(b, of_u, rtol=0, atol=8e-9 * np.abs(b).max())
 
 
+@pytest.mark.slow
+def test_derivatives_with_a_catch_agree_with_differences():
+    """A step and its linearization stand in one program there, each with a loop of its own."""
+    scene = adaptive("planar").replace(
+        payload={"mass": 20.0, "inertia": [1.0, 1.0, 1.0]},
+        phases=[
+            {"name": "free", "steps": 1, "changes": {"payload": None}},
+            {"name": "held", "steps": 1, "catch": {"position_error": 9.0}},
+        ],
+        simulation={"steps": 2},
+    )
+    kernels = compile_scene(scene)
+    x, u, p = moving_start(kernels), np.full(kernels.n_u, 0.3), kernels.stage_parameters()[0]
+    assert p[kernels.parameters.indices("catch")][0] == 1.0
+    _, b = kernels.linearize(x, u, 1.0, p=p)
+    end, moves = kernels.step(x, u, 1.0, p=p), 1e-4 * np.eye(kernels.n_u)
+    ends = kernels.step(x, np.vstack([u + moves, u - moves]), 1.0, p=p)
+    ahead, behind = np.split(kernels.difference(end, ends), 2)
+    np.testing.assert_allclose(b, ((ahead - behind) / 2e-4).T, rtol=0, atol=1e-7 * np.abs(b).max())
+
+
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
