@@ -291,7 +291,9 @@ def _wheel_limits(situation: Situation, constraint: WheelLimits) -> Iterator[Sca
             yield -speed - wheel.speed
             yield speed - wheel.speed
         if math.isfinite(wheel.power):
-            corner = wheel.power / most_torque if math.isfinite(wheel.torque) else 1.0
+            # Where a phase has no wheels, the largest torque is 0 and there is no corner.
+            largest = select(most_torque > 0.0, most_torque, wheel.torque)
+            corner = wheel.power / largest if math.isfinite(wheel.torque) else 1.0
             size = select(speed > 0.0, speed, -speed)
             most = wheel.power / select(size > 0.5 * corner, size, 0.5 * corner)
             yield corner * (-torque - most)

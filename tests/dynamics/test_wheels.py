@@ -219,6 +219,25 @@ def test_a_motor_takes_no_more_than_its_power() -> None:
     assert wheel_speed(env) - start == pytest.approx(-20.0 / 80.0 * 0.015 / MOMENTS[1], rel=0.05)
 
 
+def test_limits_of_the_power_are_numbers_in_phases_without_wheels() -> None:
+    wheels = [{**wheel, "torque": 0.5, "power": 20.0} for wheel in SKEW[1:]]
+    phases: list[dict[str, Any]] = [
+        {"name": "with", "steps": 1},
+        {"name": "without", "steps": 1, "changes": {"actuators.wheels": None}},
+    ]
+    scene = small_scene(
+        **{"actuators.wheels": wheels, "phases": phases, "simulation.steps": 2},
+        constraints=[{"name": "wheels", "kind": "wheel_limits"}],
+    )
+    kernels = compile_scene(scene)
+    x, still = kernels.layout.initial_state, np.zeros(kernels.n_u)
+    given, missing, _ = kernels.stage_parameters()
+    residuals = kernels.constraints(x, still, given)
+    np.testing.assert_array_equal(kernels.constraints(x, still, missing), residuals)
+    jacobian = kernels.constraint_jacobian(x, still, given)
+    np.testing.assert_array_equal(kernels.constraint_jacobian(x, still, missing), jacobian)
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
