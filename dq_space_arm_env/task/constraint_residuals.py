@@ -56,7 +56,7 @@ Scalars = Sequence[Scalar]
 SMALLEST_LENGTH = 1e-3
 """Length, m, by which a cone is wider at its apex, where its residual is rounded off."""
 _ROUNDING = {"float64": 1e-12, "float32": 1e-6}
-"""More than what rounding takes off 1 - sin^2 where that is 0."""
+"""More than what rounding takes off 1 - sin^2, or leaves of it, where that is 0."""
 MEETING = 1e-4
 """Distance, m, that stands for none between centers or axes of volumes."""
 
@@ -127,8 +127,9 @@ def _joint_limits(situation: Situation, limits: JointLimits) -> Iterator[Scalar]
 
 
 def _distance(situation: Situation, constraint: Distance) -> Iterator[Scalar]:
+    rounding = _ROUNDING[situation.scene.simulation.precision]
     for _, body, _, obstacle in pairs_that_may_touch(situation.scene, constraint):
-        apart = _segment_distance(_segment(situation, body), _segment(situation, obstacle))
+        apart = _segment_distance(_segment(situation, body), _segment(situation, obstacle), rounding)
         yield body.radius + obstacle.radius - apart
 
 
@@ -153,8 +154,11 @@ def _clamped(share: Scalar) -> Scalar:
     return select(share < 1.0, share, 1.0)
 
 
-def _segment_distance(first: _Segment, second: _Segment) -> Scalar:
-    """Distance of two segments (Ericson, Real-Time Collision Detection, 2005, 5.1.9)."""
+def _segment_distance(first: _Segment, second: _Segment, rounding: float) -> Scalar:
+    """Distance of two segments (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
+
+    They count as parallel where the squared sine between them may be all rounding.
+    """
     between = subtract(first.start, second.start)
     if first.along is None and second.along is None:
         return _distance_of(between)
@@ -166,7 +170,7 @@ def _segment_distance(first: _Segment, second: _Segment) -> Scalar:
         return _distance_of(add(between, scale(_clamped(-c / a), first.along)))
     e, f, b = dot(second.along, second.along), dot(second.along, between), dot(first.along, second.along)
     denominator = a * e - b * b
-    parallel = denominator <= 1e-12 * a * e
+    parallel = denominator <= rounding * a * e
     share = _clamped((b * f - c * e) / select(parallel, 1.0, denominator))
     share = select(parallel, 0.0, share)
     other = (b * share + f) / e

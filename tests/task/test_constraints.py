@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dq_space_arm_env import SceneError, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.algebra import dual_vectors, poses
+from dq_space_arm_env.algebra import dual_vectors, poses, rotations
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, terminal_rows
 from dq_space_arm_env.scene.constraints import Volume
@@ -192,10 +192,27 @@ def test_distances_against_a_search(seed):
         minimize(apart, start, bounds=[(0.0, 1.0)] * 2, tol=1e-12).fun
         for start in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5))
     )
-    found = _segment_distance(_Segment(points[0], along[0]), _Segment(points[1], along[1]))
+    found = _segment_distance(_Segment(points[0], along[0]), _Segment(points[1], along[1]), 1e-12)
     assert found == pytest.approx(math.hypot(search, 1e-4), abs=1e-7)
-    turned = _segment_distance(_Segment(points[1], along[1]), _Segment(points[0], along[0]))
+    turned = _segment_distance(_Segment(points[1], along[1]), _Segment(points[0], along[0]), 1e-12)
     assert turned == pytest.approx(found, abs=1e-9)
+
+
+def test_distances_of_parallel_segments_have_their_derivatives_in_single_precision():
+    """About their axis the one turns and stays parallel, but for what rounding changes."""
+    axis = np.array([0.8, 0.3, 0.5])
+    rod = {"frame": "base", "position": [-0.5, 0.1, 0.3], "to": [0.3, 0.4, 0.8], "radius": 0.1}
+    wall = {"frame": "inertial", "position": [-0.7, 0.9, 0.2], "to": [0.42, 1.32, 0.9], "radius": 0.1}
+    keep = {"kind": "distance", "name": "apart", "bodies": [rod], "obstacles": [wall]}
+    scene, found = load_scene("no-wrist").replace(constraints=[keep]), []
+    for precision in ("float64", "float32"):
+        kernels = compile_scene(scene.replace(simulation={"precision": precision}))
+        x = np.tile(kernels.layout.initial_state, (50, 1))
+        for row, angle in zip(x, np.linspace(-1.0, 1.0, len(x)), strict=True):
+            turn = rotations.from_axis_angle(tuple(axis / np.linalg.norm(axis)), angle)
+            row[:8] = poses.from_rotation_and_position(turn, (0.1, 0.0, -0.1))
+        found.append(kernels.constraint_jacobian(x.astype("f4"), np.zeros((len(x), kernels.n_u))))
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-5)
 
 
 def placed(pose):
