@@ -22,6 +22,8 @@ from dq_space_arm_env.task.equations import SceneEquations, torque_ranges
 Scalar = Any
 Scalars = Sequence[Scalar]
 
+_ROUNDING = {"float64": 1e-12, "float32": 1e-6}
+"""More than what rounding adds to the shortest pulse, relative to it."""
 _LEAST_BURN = 1e-30  # kg, below which nothing burns
 _LEAST_SPEED = 1e-9  # rad/s, below which no power limits a wheel's torque
 
@@ -52,7 +54,7 @@ def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
         if thruster.impulse_bit(thruster.force):
             # A pulse of the largest force with the impulse f h; one of the shortest is rounded into it.
             shortest = thruster.impulse_bit(equations.control_limits[index])
-            least = (1.0 - 1e-12) * shortest / scene.simulation.dt
+            least = (1.0 - _ROUNDING[scene.simulation.precision]) * shortest / scene.simulation.dt
             result[index] = casadi.if_else(result[index] < least, 0.0, result[index])
     if scene.actuators.tank is not None:
         _burn(equations, x, result)

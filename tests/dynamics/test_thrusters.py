@@ -79,6 +79,18 @@ def test_a_jet_is_off_below_zero_and_fires_no_pulse_shorter_than_its_shortest() 
     np.testing.assert_array_equal(layout.lower_limits(layout.control_limit), np.zeros(4))
 
 
+@pytest.mark.parametrize("dt", [0.01, 0.015, 0.1])
+def test_jets_that_are_on_for_whole_steps_fire_in_single_precision(dt: float) -> None:
+    forces = (5.0, 0.1, 0.3, 0.7, 1.1, 3.3, 7.7, 22.0)
+    jets = [{**JETS[i % 4], "force": force, "minimum_on_time": dt} for i, force in enumerate(forces)]
+    changes = {"actuators.thrusters": jets, "simulation.precision": "float32", "simulation.dt": dt}
+    kernels = compile_scene(planar(parameters=["actuators"], **changes))
+    limits = kernels.layout.control_limit.astype("f4")
+    np.testing.assert_array_equal(kernels.applied_inputs(kernels.layout.initial_state, limits), limits)
+    weaker = kernels.applied_inputs(kernels.layout.initial_state, 0.9999 * limits)
+    np.testing.assert_array_equal(weaker, 0.0)
+
+
 @pytest.mark.slow
 def test_the_expert_only_pushes_and_the_environment_flies_its_plan() -> None:
     from experts import GuidedDDP
