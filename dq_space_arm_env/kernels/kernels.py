@@ -116,8 +116,9 @@ class Kernels(DerivativeKernels):
     def numerical_error(self, states: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Tell how far the tips of a simulated motion are from where the same inputs truly bring them.
 
-        A companion follows the motion from its first state in double precision: with `rk8`, divided by a
-        tolerance of 1e-8 or less, or with a hundredth of the scene's tolerances if those are adaptive.
+        A companion follows the motion from its first state in double precision, by another method: by `rk8`,
+        or by `rk6` in place of `rk8`, and `rodas4` and `rodas5p` in place of each other. It divides steps by
+        a hundredth of the scene's tolerance (1e-8 at most), and errors below that are hidden by its own.
         Where the motion is chaotic the two part, however accurate the single steps are.
 
         Args:

@@ -1,4 +1,4 @@
-"""How far a simulated motion is from the true one, by a companion with a much smaller tolerance."""
+"""How far a simulated motion is from the true one: another method follows it, with much finer tolerances."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from dq_space_arm_env.scene import INTEGRATORS, Scene
 
 Array = NDArray[Any]
 
-FINER = 1e-2
-"""Tolerances of the companion of an adaptive method, relative to its own."""
-COMPANION, TOLERANCE = "rk8", 1e-8
-"""Integrator and tolerance [rad, m] of the companion of a method that takes fixed steps."""
+FINER, LARGEST, SMALLEST = 1e-2, 1e-8, 1e-12
+"""Tolerance of the companion, relative to the scene's, and its bounds [rad, m]: less is lost in rounding."""
+COMPANIONS = {"rk8": "rk6", "rodas4": "rodas5p", "rodas5p": "rodas4"}
+"""Integrator of the companion, by that of the scene: never the same one, whose errors it would share."""
+COMPANION = "rk8"
+"""Integrator of the companion of the other ones."""
 
 
 def companion(scene: Scene) -> Scene:
-    """The scene in double precision, with tolerances that make its steps' errors negligible."""
+    """The scene in double precision, with another method and a tolerance that makes errors negligible."""
     simulation, name = scene.simulation, scene.simulation.integrator
-    keys = {**dict.fromkeys(("rtol", "atol", "tolerance")), "precision": "float64"}
-    if INTEGRATORS[name].is_adaptive:
-        finer = {key: FINER * simulation.tolerance_of(key) for key in INTEGRATORS[name].tolerances}
-        return scene.replace(simulation={**keys, **finer})
-    tolerance = min(TOLERANCE, FINER * simulation.division)
-    return scene.replace(simulation={**keys, "integrator": COMPANION, "tolerance": tolerance})
+    entry, integrator = INTEGRATORS[name], COMPANIONS.get(name, COMPANION)
+    own = simulation.tolerance_of(entry.tolerances[0]) if entry.is_adaptive else simulation.division
+    tolerance = min(LARGEST, max(FINER * own, SMALLEST))
+    keys = {"integrator": integrator, "tolerance": tolerance, "rtol": None, "atol": None}
+    return scene.replace(simulation={**keys, "precision": "float64"})
 
 
 def numerical_error(finer: RobotKernels, states: ArrayLike, u: ArrayLike, p: ArrayLike | None) -> Array:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import SceneError, compile_scene, load_scene
+from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import INTEGRATORS
 
 EMBEDDED = [name for name, entry in INTEGRATORS.items() if entry.is_embedded]
@@ -133,3 +134,27 @@ def test_the_numerical_error_is_that_of_the_motion(scene):
     np.testing.assert_array_equal(coarse.numerical_error(np.array(motion), u, np.empty(n_p)), errors)
     with pytest.raises(ValueError, match=rf"p: shape \(2, {n_p}\), should be \({n_p},\)$"):
         coarse.numerical_error(np.array(motion), u, np.empty((2, n_p)))
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerances", "rate"),
+    [
+        ("dormand_prince", {"rtol": 1e-2, "atol": 1e-2}, 6.0),
+        pytest.param("rodas4", {"tolerance": 1e-2}, 6.0, marks=pytest.mark.slow),
+        pytest.param("rodas5p", {"tolerance": 1e-2}, 10.0, marks=pytest.mark.slow),
+        ("rk8", {"tolerance": "off"}, 1.5),
+    ],
+)
+def test_the_numerical_error_of_a_whole_step_is_not_that_of_another_one(scene, name, tolerances, rate):
+    """A companion of the same method would take the same step, and find no error."""
+    settings = {"integrator": name, "dt": 0.05, "tolerance": None, **tolerances}
+    kernels = compile_scene(scene.replace(simulation=settings))
+    x, u = states(kernels, rate, 4)
+    motion, right = np.stack([x, kernels.step(x, u)]), x
+    for _ in range(50):
+        right = kernels.step(right, u, 0.001, "rk8")
+    errors = kernels.numerical_error(motion, u[None])[1]
+    tips = [tuple(kernels.tip_pose(each).T) for each in (motion[1], right)]
+    true = np.maximum(poses.error_distance(*tips), poses.error_angle(*tips))
+    assert errors.min() > 0.0
+    np.testing.assert_allclose(errors, true, rtol=0.01, atol=2e-8)
