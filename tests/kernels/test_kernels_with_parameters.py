@@ -164,6 +164,11 @@ def test_a_scene_of_constants_takes_none():
     x, u = moving(kernels, 1)
     with pytest.raises(ValueError, match=r"p: .*the parameters of scene 'planar' are none"):
         kernels.step(x[0], u[0], p=[1.0])
+    expected = kernels.step(x[0], u[0], p=np.empty(0))
+    for wrong in ([1.0], np.ones(3), "wrong"):
+        with pytest.raises((ValueError, TypeError), match=r"^p: "):
+            kernels.step(x[0], u[0], p=wrong)
+    np.testing.assert_array_equal(kernels.step(x[0], u[0], p=np.empty(0)), expected)
     with pytest.raises(ValueError, match="no parameters to differentiate by"):
         kernels.linearize_parameters(x[0], u[0])
 
