@@ -29,7 +29,10 @@ def real_array(name: str, values: ArrayLike, dtype: DTypeLike | None = None) -> 
     """
     if isinstance(values, np.ma.MaskedArray):
         raise TypeError(f"{name}: a masked array, should be real numbers without a mask; fill it first")
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{name}: rows that differ in length, should be an array of real numbers") from error
     if array.dtype.kind not in "fiub":
         raise TypeError(f"{name}: of type {array.dtype}, should be real numbers")
     return array if dtype is None else array.astype(dtype, copy=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -51,15 +52,8 @@ class MotionCurve:
         Raises:
             ValueError: If a time lies outside the motion.
         """
-        times = np.asarray(t, dtype=np.float64)
-        if times.ndim > 1:
-            raise ValueError(f"t: shape {times.shape}, should be a number or (k,)")
         end = self._times[-1]
-        within = (times >= min(0.0, end)) & (times <= max(0.0, end))
-        if not within.all():
-            raise ValueError(
-                f"t: {times[~within].flat[0]} is not between 0 and {end} s, where the motion is known"
-            )
+        times = _times_within("t", t, end)
         sign = -1.0 if end < 0.0 else 1.0
         step = np.searchsorted(sign * self._times[1:-1], sign * times, side="right")
         begin = self._times[step]
@@ -149,6 +143,7 @@ def integrate(
     parameters = kernels.parameter_rows(p, len(held))
     _check_smooth(kernels, parameters)
     _check_accuracy(kernels, duration, rtol, atol, max_steps)
+    wanted = None if times is None else np.atleast_1d(_times_within("times", times, duration))
     tolerances = np.array([rtol, atol], kernels.dtype)
     stepper = _Stepper(kernels, start, tolerances, kernels.scene.simulation.dt)
     ends, states = [0.0], [start]
@@ -193,10 +188,22 @@ def integrate(
             p=p,
         )
 
-    if times is None:
+    if wanted is None:
         return IntegratedMotion(np.array(ends), np.array(states), len(coefficients), rejected, curve, finer)
-    wanted = np.atleast_1d(np.asarray(times, dtype=np.float64))
     return IntegratedMotion(wanted, curve(wanted), len(coefficients), rejected, curve, finer)
+
+
+def _times_within(name: str, given: ArrayLike, end: float) -> Array:
+    """Times of a motion that ends at a time, shape () or (k,); refuses others, by the argument's name."""
+    times = real_array(name, given, np.float64)
+    if times.ndim > 1:
+        raise ValueError(f"{name}: shape {times.shape}, should be a number or (k,)")
+    within = (times >= min(0.0, end)) & (times <= max(0.0, end))
+    if not within.all():
+        raise ValueError(
+            f"{name}: {times[~within].flat[0]} is not between 0 and {end} s, where the motion is known"
+        )
+    return times
 
 
 def _intervals(
@@ -245,11 +252,15 @@ def _check_accuracy(
 ) -> None:
     """Refuse a time, tolerances or a number of steps with which no motion can be followed."""
     for name, value in (("rtol", rtol), ("atol", atol)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise ValueError(f"{name}: {value}, should be a positive number")
-    if not np.isfinite(duration) or duration == 0.0:
-        raise ValueError(f"duration: {duration} should be a finite time in s other than zero")
+        if not (_is_number(value) and np.isfinite(value) and value > 0.0):
+            raise ValueError(f"{name}: {value!r}, should be a positive number")
+    if not (_is_number(duration) and np.isfinite(duration)) or duration == 0.0:
+        raise ValueError(f"duration: {duration!r}, should be a finite time in s other than zero")
     if rtol < (least := _smallest_rtol(kernels)):
         raise ValueError(f"rtol: {rtol}, should be at least {least:.1e} in {kernels.dtype}")
-    if max_steps < 1:
-        raise ValueError(f"max_steps: {max_steps}, should be at least 1")
+    if not (_is_number(max_steps) and max_steps >= 1):
+        raise ValueError(f"max_steps: {max_steps!r}, should be a number of at least 1")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)

@@ -106,8 +106,9 @@ class Kernels(DerivativeKernels):
             ValueError: If dt is not a finite number, or the integrator is unknown or estimates no error, as
                 where `simulation.tolerance` is off.
         """
-        name, simulation = integrator or self.scene.simulation.integrator, self.scene.simulation
-        if name in INTEGRATORS and not simulation.estimates_error(name):
+        simulation = self.scene.simulation
+        name = self._integrator(integrator) or simulation.integrator
+        if not simulation.estimates_error(name):
             known = ", ".join(filter(simulation.estimates_error, INTEGRATORS))
             raise ValueError(f"integrator: {name!r} estimates no error; choose from {known}")
         x_next, error = self._step_call("checked_step", x, u, dt, integrator, p)

@@ -36,8 +36,8 @@ def companion(scene: Scene) -> Scene:
 def numerical_error(finer: RobotKernels, states: ArrayLike, u: ArrayLike, p: ArrayLike | None) -> Array:
     """See `Kernels.numerical_error`; `finer` are the functions of the companion."""
     motion, controls = real_array("states", states), real_array("u", u)
-    expected = len(controls) + 1, *controls.shape[1:-1], finer.n_x
-    if motion.shape != expected or controls.ndim not in (2, 3):
+    expected = (controls.shape[0] + 1, *controls.shape[1:-1], finer.n_x) if controls.ndim in (2, 3) else None
+    if motion.shape != expected:
         raise ValueError(
             f"states, u: shapes {motion.shape} and {controls.shape}, should be (N + 1, n_x) and (N, n_u), or "
             "(N + 1, B, n_x) and (N, B, n_u)"

@@ -94,5 +94,5 @@ def test_real_numbers_of_any_type_are_taken(action, single):
 
 
 def test_a_ragged_action_is_refused(single):
-    with pytest.raises(ValueError, match="inhomogeneous"):
+    with pytest.raises(ValueError, match="action: rows that differ in length"):
         single.step([[0.1, 0.2], [0.1]])

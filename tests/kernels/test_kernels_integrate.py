@@ -127,11 +127,18 @@ def test_a_motion_that_ends_is_reported(arm):
         ({"x": np.zeros(3)}, r"x: shape \(3,\), should be \(23,\)"),
         ({"u": np.zeros(5)}, r"u: shape \(5,\), should be \(12,\) or \(N, 12\)"),
         ({"x": np.full(23, np.nan)}, r"x: nan is not a finite number"),
-        ({"duration": 0.0}, r"duration: 0.0 should be a finite time"),
+        ({"duration": 0.0}, r"duration: 0.0, should be a finite time"),
+        ({"duration": "1"}, r"duration: '1', should be a finite time"),
+        ({"duration": None}, r"duration: None, should be a finite time"),
         ({"rtol": 1e-17}, r"rtol: 1e-17, should be at least 8.9e-16 in float64"),
+        ({"rtol": "1e-6"}, r"rtol: '1e-6', should be a positive number"),
+        ({"rtol": np.array([1e-6, 1e-6])}, r"rtol: array\(.*\), should be a positive number"),
         ({"atol": np.nan}, r"atol: nan, should be a positive number"),
-        ({"max_steps": 0}, r"max_steps: 0, should be at least 1"),
-        ({"times": [0.5, 1.5]}, r"t: 1.5 is not between 0 and 1.0 s"),
+        ({"max_steps": 0}, r"max_steps: 0, should be a number of at least 1"),
+        ({"max_steps": "9"}, r"max_steps: '9', should be a number of at least 1"),
+        ({"max_steps": np.nan}, r"max_steps: nan, should be a number of at least 1"),
+        ({"times": [0.5, 1.5]}, r"times: 1.5 is not between 0 and 1.0 s"),
+        ({"times": [[0.5]]}, r"times: shape \(1, 1\), should be a number or \(k,\)"),
     ],
 )
 def test_bad_arguments_are_refused(arm, changes, sentence):
@@ -139,6 +146,19 @@ def test_bad_arguments_are_refused(arm, changes, sentence):
     arguments = {"x": x, "u": np.zeros(kernels.n_u), "duration": 1.0, **changes}
     with pytest.raises(ValueError, match=sentence):
         kernels.integrate(arguments.pop("x"), arguments.pop("u"), arguments.pop("duration"), **arguments)
+
+
+@pytest.mark.parametrize("times", ["a", [0.5j], np.ma.masked_array([0.5], [True])])
+def test_times_are_real_numbers(arm, times):
+    kernels, x = arm
+    u = np.zeros(kernels.n_u)
+    with pytest.raises(TypeError, match=r"^times: .* should be real numbers"):
+        kernels.integrate(x, u, 1.0, times=times)
+    motion = kernels.integrate(x, u, 1.0)
+    with pytest.raises(TypeError, match=r"^t: .* should be real numbers"):
+        motion.sol(times)
+    with pytest.raises(ValueError, match=r"^t: 1.5 is not between 0 and 1.0 s"):
+        motion.sol(1.5)
 
 
 def test_the_global_error_is_estimated(arm):
