@@ -40,7 +40,7 @@ def cache_directory() -> Path:
     """
     configured = os.environ.get("DQ_SPACE_ARM_CACHE")
     if configured:
-        return Path(configured)
+        return Path(os.path.expanduser(configured))  # noqa: PTH111 - leaves "~" as it is without a home
     try:
         folder = Path(platformdirs.user_cache_dir("dq-space-arm"))
     except RuntimeError:  # of recent versions; others leave "~" as it is

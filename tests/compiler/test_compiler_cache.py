@@ -6,6 +6,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,6 +42,14 @@ def test_a_user_without_a_home_has_a_cache_of_temporary_files(answer, tmp_path, 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert code_cache.cache_directory() == tmp_path / f"dq-space-arm-{os.getuid()}"
     assert caches()["writable"]
+
+
+@posix
+def test_a_folder_in_ones_home_may_be_written_short(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for given, folder in (("~/kernels", tmp_path / "kernels"), ("/a/~", Path("/a/~"))):
+        monkeypatch.setenv("DQ_SPACE_ARM_CACHE", given)
+        assert code_cache.cache_directory() == folder
 
 
 class Builder:
