@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import walk
 from dq_space_arm_env.kernels.derivative_kernels import DerivativeKernels
+from dq_space_arm_env.kernels.library import check_threads
 from dq_space_arm_env.scene import INTEGRATORS, Scene, load_scene
 
 if TYPE_CHECKING:
@@ -423,6 +424,7 @@ def compile_scene(scene: Scene | str | Path, threads: int = 1) -> Kernels:
 
     Raises:
         SceneError: If the scene cannot be loaded.
-        ValueError: If the number of threads is not positive.
+        ValueError: If the number of threads is not a whole one of at least 1.
     """
+    check_threads(threads)  # kernels for 1 thread would be found for 1.0 and for True as well
     return _compiled(load_scene(scene), threads)

@@ -41,8 +41,7 @@ class KernelLibrary:
     """The compiled programs of a scene, by name."""
 
     def __init__(self, scene: Scene, threads: int = 1) -> None:
-        if not isinstance(threads, int | np.integer) or threads < 1:
-            raise ValueError(f"threads: {threads!r}, should be a whole number of at least 1")
+        check_threads(threads)
         self.scene, self.threads, self.layout = scene, threads, StateLayout.of(scene)
         layout = self.layout
         self.n_x, self.n_t, self.n_u, self.n_p = layout.n_x, layout.n_t, layout.n_u, layout.n_p
@@ -237,6 +236,12 @@ class KernelLibrary:
                 f"parameters of scene {self.scene.name!r} are {', '.join(self.parameters.names) or 'none'}"
             )
         return given
+
+
+def check_threads(threads: Any) -> None:
+    """Raise ValueError unless work can be shared among so many threads."""
+    if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or threads < 1:
+        raise ValueError(f"threads: {threads!r}, should be a whole number of at least 1")
 
 
 def compile_program(program: Program, lanes: int) -> BoundKernel:

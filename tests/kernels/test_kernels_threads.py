@@ -101,6 +101,10 @@ def test_work_is_done_where_no_more_threads_can_be_started(monkeypatch):
 def test_no_thread_at_all_is_refused():
     with pytest.raises(ValueError, match="threads: 0, should be a whole number of at least 1"):
         Kernels(load_scene("paper"), threads=0)
+    assert compile_scene("paper", np.int64(1)) is compile_scene("paper")
+    for number in (1.0, True):
+        with pytest.raises(ValueError, match=f"threads: {number}, should be a whole number of at least 1"):
+            compile_scene("paper", threads=number)
 
 
 def test_threads_that_share_the_kernels_get_their_own_results(draw):
