@@ -12,7 +12,7 @@ at the same rate but later, so append a few more passes after the loop. Buffers 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from dq_space_arm_env.compiler.forward_mode import (
@@ -29,8 +29,8 @@ Names = tuple[str, ...]
 """Names of the tangent buffers of a buffer, one for each direction."""
 
 
-def append_tangents(program: Program, by: Sequence[str], of: Sequence[str]) -> dict[str, Names | None]:
-    """Add the calls that compute the derivatives of some buffers by the entries of inputs.
+def append_tangents(program: Program, by: Sequence[str], of: str) -> Names | None:
+    """Add the calls that compute the derivatives of a buffer by the entries of inputs.
 
     Append own calls on the tangent buffers, see `append_for_each`, and gather them in an output, see
     `append_matrix`.
@@ -38,43 +38,39 @@ def append_tangents(program: Program, by: Sequence[str], of: Sequence[str]) -> d
     Args:
         program: The program, changed in place; its results stay the same up to rounding.
         by: Names of the inputs, float numbers that no call overwrites.
-        of: Names of the buffers to differentiate, as they are after the last call.
+        of: Name of the buffer to differentiate, as it is after the last call.
 
     Returns:
-        For each of these buffers the names of its tangent buffers, one for each entry of the inputs, in their
-        order; None if it does not depend on them.
+        The names of its tangent buffers, one for each entry of the inputs, in their order; None if it does
+        not depend on them.
 
     Raises:
-        ValueError: The program has no such input or buffers, overwrites the input, has tangents already, or
+        ValueError: The program has no such input or buffer, overwrites the input, has tangents already, or
             has a guard.
     """
     transformation = _Transformation(program, by, of)
     program.calls, program.loops = transformation.calls, transformation.loops
-    return {name: transformation.names(name) for name in of}
+    return transformation.names(of)
 
 
-def append_for_each(
-    program: Program, graph: Graph, tangents: Mapping[str, Names], output: str, **bindings: str
-) -> Names:
+def append_for_each(program: Program, graph: Graph, key: str, tangents: Names, output: str) -> Names:
     """Append a call of a graph for each direction.
 
     Args:
         program: A program with tangents.
         graph: A graph with a single output.
-        tangents: The tangent buffers that are inputs of the graph, by the input's name.
+        key: Name of its input that is a tangent.
+        tangents: The tangent buffers.
         output: Name of the graph's results; `.0`, `.1` ... are added.
-        **bindings: Buffers of its other inputs, if named otherwise.
 
     Returns:
         The names of the results.
     """
-    ((key, _),) = graph.outputs
-    columns = zip(*tangents.values(), strict=True)
-    names = []
-    for number, buffers in enumerate(columns):
-        names.append(f"{output}.{number}")
-        program.call(graph, **bindings, **dict(zip(tangents, buffers, strict=True)), **{key: names[-1]})
-    return tuple(names)
+    ((result, _),) = graph.outputs
+    names = tuple(f"{output}.{number}" for number in range(len(tangents)))
+    for tangent, name in zip(tangents, names, strict=True):
+        program.call(graph, **{key: tangent, result: name})
+    return names
 
 
 def append_matrix(program: Program, tangents: Names | None, shape: tuple[int, int], output: str) -> None:
@@ -101,7 +97,7 @@ def append_matrix(program: Program, tangents: Names | None, shape: tuple[int, in
 class _Transformation:
     """The calls of a program with those of its tangents."""
 
-    def __init__(self, program: Program, by: Sequence[str], of: Sequence[str]) -> None:
+    def __init__(self, program: Program, by: Sequence[str], of: str) -> None:
         self._program, self._by = program, by
         self._sizes = program.scratch_sizes()
         self._check(of)
@@ -121,7 +117,7 @@ class _Transformation:
         places.append(len(self.calls))
         self.loops = [Loop(places[loop.begin], places[loop.end], loop.condition) for loop in program.loops]
 
-    def _check(self, of: Sequence[str]) -> None:
+    def _check(self, of: str) -> None:
         program = self._program
         inputs = {buffer.name: buffer.dtype for buffer in program.inputs}
         if program.guards:
@@ -129,11 +125,10 @@ class _Transformation:
         for name in self._by:
             if name not in inputs or inputs[name] == "bool":
                 raise ValueError(f"program {program.name!r} has no input {name!r} of float numbers")
-        if any(f"{name}.0" in self._sizes for name in (*self._by, *of)):
+        if any(f"{name}.0" in self._sizes for name in (*self._by, of)):
             raise ValueError(f"program {program.name!r} has tangents already")
-        for name in of:
-            if name not in self._sizes:
-                raise ValueError(f"program {program.name!r} has no buffer {name!r} to differentiate")
+        if of not in self._sizes:
+            raise ValueError(f"program {program.name!r} has no buffer {of!r} to differentiate")
         for call in program.calls:
             for name in set(self._by) & set(bound(call, call.graph.outputs).values()):
                 raise ValueError(f"program {program.name!r}: {call.graph.name!r} overwrites {name!r}")
@@ -158,9 +153,9 @@ class _Transformation:
         """Buffers that depend on the input."""
         return reached(set(self._by), self._links())
 
-    def _needed(self, of: Sequence[str]) -> set[str]:
-        """Buffers on which the wanted ones depend."""
-        return reached(set(of), [(after, before) for before, after in self._links()])
+    def _needed(self, of: str) -> set[str]:
+        """Buffers on which the wanted one depends."""
+        return reached({of}, [(after, before) for before, after in self._links()])
 
     def _tangent_graphs(self) -> dict[str, TangentGraphs]:
         """Tangents by name of the graph, for whatever any of its calls needs."""

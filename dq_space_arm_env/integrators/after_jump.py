@@ -38,10 +38,8 @@ class StepAndJump:
         self.method.append_step(program, field)
         rename(program, begin, {"x_next": self._x})
         x = symbols("x", field.n_x)
-        graph = graph_of(
-            f"{field.name}_{self.before}_jump", graph_inputs(field, **{self._x: x}), {"x_next": self.jump(x)}
-        )
-        program.call(graph)
+        inputs = graph_inputs(field, **{self._x: x})
+        program.call(graph_of(self._prefix(field), inputs, {"x_next": self.jump(x)}))
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         """See `Integrator.append_linearization`."""

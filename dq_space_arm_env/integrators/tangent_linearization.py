@@ -22,9 +22,9 @@ def append_tangent_linearization(
 ) -> tuple[Any, Any]:
     """Append the calls that turn x, u, h into A and B; see `Integrator.append_linearization`."""
     append_step(program, field)
-    changes = append_tangents(program, ("x", "u"), ["x_next"])["x_next"]
+    changes = append_tangents(program, ("x", "u"), "x_next")
     assert changes is not None
-    names = append_for_each(program, tangent_graph(field), {"change": changes}, "dx_next")
+    names = append_for_each(program, tangent_graph(field), "change", changes, "dx_next")
     pose, n_t = field.pose, field.n_y + (len(field.pose.directions) if field.pose is not None else 0)
     x, free = symbols("x", field.n_x), [symbols(f"d{j}", n_t) for j in range(len(names))]
     by_x, by_u = (

@@ -101,4 +101,4 @@ def test_guards_are_not_nested_and_have_no_derivatives():
     with pytest.raises(ValueError, match="'guarded' has a loop or a guard, which has no reverse"):
         append_cotangents(guarded(), {"ran": "x"}, ("x",))
     with pytest.raises(ValueError, match="'guarded' has a guard, which has no tangents"):
-        append_tangents(guarded(), ("x",), ("ran",))
+        append_tangents(guarded(), ("x",), "ran")

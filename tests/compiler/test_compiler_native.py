@@ -266,7 +266,7 @@ def test_calls_of_two_graphs_of_one_name_are_refused(use):
     for factor, source, target in ((2.0, "x", "a"), (2.0, "a", "b"), (3.0, "b", "y")):
         graph = trace("scaled", {"x": 1}, lambda x, factor=factor: {"y": [factor * x[0]]})
         program.call(graph, x=source, y=target)
-    given = {build_program: [1], append_tangents: [["x"], ["y"]], append_cotangents: [{"y": "x"}, ["x"]]}
+    given = {build_program: [1], append_tangents: [["x"], "y"], append_cotangents: [{"y": "x"}, ["x"]]}
     with pytest.raises(ValueError, match="calls of two graphs named 'scaled', should have"):
         use(program, *given[use])
 

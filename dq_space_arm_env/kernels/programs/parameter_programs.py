@@ -38,10 +38,9 @@ class ParameterPrograms:
         inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)]
         program = Program("linearize_parameters", program_inputs(field, *inputs), [])
         stage_method(self.equations, integrator).append_step(program, field)
-        changes = append_tangents(program, ["parameters"], ["x_next"])["x_next"]
+        changes = append_tangents(program, ["parameters"], "x_next")
         if changes is not None:
-            graph = tangent_graph(field)
-            changes = append_for_each(program, graph, {"change": changes}, "dx_next")
+            changes = append_for_each(program, tangent_graph(field), "change", changes, "dx_next")
         append_matrix(program, changes, (field.n_t, n_p), "P")
         program.outputs = [Buffer("P", field.n_t * n_p)]
         return program
