@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from gymnasium import wrappers
-from gymnasium.vector import VectorWrapper
+from gymnasium.vector import AsyncVectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from agents.policies import ExportedPolicy
@@ -19,8 +20,20 @@ from agents.policies.pickled_arrays import Inert, PickledError, as_array, read_p
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_bytes
 
 _MOST_BYTES = 1 << 24
-_PLAIN_OBSERVATIONS = (wrappers.DtypeObservation, wrappers.FlattenObservation)
-"""Wrappers that leave the numbers of an observation as they are."""
+_HARMLESS = frozenset(
+    {
+        # of this project; what happens to actions is noted in their space, or they are held
+        *("RepeatAction", "ShapeReward", "ShrinkActionSpace", "Lagrangian"),
+        # of Gymnasium, most for single and vector environments alike
+        *("Autoreset", "DictInfoToList", "HumanRendering", "OrderEnforcing", "PassiveEnvChecker"),
+        *("RecordEpisodeStatistics", "RecordVideo", "RenderCollection", "TimeLimit"),
+        *("DtypeObservation", "FlattenObservation", "NormalizeReward", "RewardWrapper"),
+        *("VectorRewardWrapper", "VectorActionWrapper"),  # `SB3VecEnv` notes or refuses these
+        # of Stable-Baselines3; the statistics of `VecNormalize` are read
+        *("Monitor", "VecCheckNan", "VecMonitor", "VecNormalize", "VecVideoRecorder"),
+    }
+)
+"""Wrappers that leave the numbers of observations and actions as they are, or tell what they do."""
 _VEC_NORMALIZE = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
 
 
@@ -123,9 +136,10 @@ def statistics_of(model: Any, file: str | Path | None = None) -> ObservationStat
 
 
 def _check_wrappers(model: Any) -> None:
-    """Refuse Gymnasium's wrappers that change what a model in memory sees or does without its knowledge."""
+    """Refuse wrappers that may change what a model in memory sees or does without its knowledge."""
     environment: Any = getattr(model, "get_env", lambda: None)()
     while hasattr(environment, "venv"):
+        _check_wrapper(environment)
         environment = environment.venv
     env: Any = getattr(environment, "vector_env", environment)
     while env is not None:
@@ -139,37 +153,75 @@ def _check_wrappers(model: Any) -> None:
             return
 
 
-def _check_wrapper(env: gymnasium.Wrapper[Any, Any, Any, Any] | VectorWrapper) -> None:
+def _check_wrapper(env: Any) -> None:
+    """Refuse a wrapper, of Gymnasium or Stable-Baselines3, unless it is known to be harmless."""
+    name = type(env).__name__
+    if isinstance(env, gymnasium.ActionWrapper):
+        if _changes_actions(env):
+            raise StatisticsError(
+                f"the model's actions pass {name} of a single environment, which it does not note: train in "
+                "agents.SB3VecEnv with gymnasium.wrappers.vector.RescaleAction"
+            )
+        return
+    if _is_harmless(env):
+        return
     if isinstance(env, wrappers.NormalizeObservation):
         raise StatisticsError(
             "the model's observations pass Gymnasium's NormalizeObservation, whose statistics are not "
             "read: train in VecNormalize of Stable-Baselines3"
         )
-    if isinstance(env, gymnasium.ObservationWrapper) and not isinstance(env, _PLAIN_OBSERVATIONS):
+    if isinstance(env, gymnasium.ObservationWrapper):
         raise StatisticsError(
-            f"the model's observations pass {type(env).__name__}, which only its environment applies: "
-            "give a function of plain observations that applies it before model.predict"
+            f"the model's observations pass {name}, which only its environment applies: give a function of "
+            "plain observations that applies it before model.predict"
         )
-    if isinstance(env, gymnasium.ActionWrapper) and _changes_actions(env):
-        raise StatisticsError(
-            f"the model's actions pass {type(env).__name__} of a single environment, which it does not "
-            "note: train in agents.SB3VecEnv with gymnasium.wrappers.vector.RescaleAction"
-        )
+    raise StatisticsError(
+        f"the model's observations or actions may pass {name}, which only its environment applies: give a "
+        "function of plain observations that applies it around model.predict; one that changes rewards "
+        "alone should be a gymnasium.RewardWrapper"
+    )
+
+
+def _is_harmless(env: Any) -> bool:
+    """Whether a wrapper is one that is known to be harmless, or made from it."""
+    known = "agents", "gymnasium", "stable_baselines3"
+    return any(
+        kind.__name__ in _HARMLESS and kind.__module__.partition(".")[0] in known
+        for kind in type(env).__mro__
+    )
+
+
+class _Doubtful(type):
+    """Type whose instances are all wrappers that would be refused."""
+
+    def __instancecheck__(cls, env: Any) -> bool:
+        try:
+            _check_wrapper(env)
+        except StatisticsError:
+            return True
+        return False
+
+
+class DoubtfulWrapper(metaclass=_Doubtful):
+    """What other processes are asked for: they find it by its name."""
 
 
 def _check_elsewhere(env: Any) -> None:
-    """Refuse wrappers in other processes, of which no more is known than that they are there."""
-    if hasattr(env, "env_is_wrapped"):  # of Stable-Baselines3, which asks the processes
-        if getattr(env, "closed", False):
-            raise StatisticsError(
-                "the model's environments in other processes are closed, so that their wrappers cannot be "
-                "seen: evaluate and export it before"
-            )
-        kinds = gymnasium.ObservationWrapper, gymnasium.ActionWrapper
-        is_wrapped = any(any(env.env_is_wrapped(kind)) for kind in kinds)
-    else:  # of Gymnasium, whose `make_vec` notes what it wraps with
-        spec = getattr(env, "spec", None)
-        is_wrapped = spec is not None and bool(spec.kwargs.get("wrappers"))
+    """Refuse wrappers in other processes, as far as these tell."""
+    noted = getattr(getattr(env, "spec", None), "kwargs", None)  # by Gymnasium's `make_vec`
+    asks = hasattr(env, "env_is_wrapped") or (isinstance(env, AsyncVectorEnv) and noted is None)
+    if asks and getattr(env, "closed", False):
+        raise StatisticsError(
+            "the model's environments in other processes are closed, so that their wrappers cannot be "
+            "seen: evaluate and export it before"
+        )
+    if hasattr(env, "env_is_wrapped"):  # of Stable-Baselines3
+        is_wrapped = any(env.env_is_wrapped(DoubtfulWrapper))
+    elif asks:  # "<Wrapper<Environment<Id>>>", or "<Wrapper<Environment instance>>"
+        names = {name for text in env.call("__str__") for name in re.findall(r"<(\w+)(?=<\w+[< ])", text)}
+        is_wrapped = not names <= _HARMLESS
+    else:
+        is_wrapped = bool((noted or {}).get("wrappers"))
     if is_wrapped:
         raise StatisticsError(
             "the model's observations or actions pass wrappers in other processes, which only its "
@@ -178,11 +230,13 @@ def _check_elsewhere(env: Any) -> None:
 
 
 def _changes_actions(env: gymnasium.ActionWrapper[Any, Any, Any]) -> bool:
-    """Whether a wrapper does more than to clip actions."""
+    """Whether a wrapper does more than to clip actions, or to rescale them to where they are."""
     if isinstance(env, wrappers.ClipAction):
         return False
     space: Any = env.action_space
-    return not all(np.allclose(env.action(end), end, rtol=1e-6) for end in (space.low, space.high))
+    return not isinstance(env, wrappers.RescaleAction) or not all(
+        np.allclose(env.action(end), end, rtol=1e-6) for end in (space.low, space.high)
+    )
 
 
 def _sees_normalized(model: Any) -> bool | None:

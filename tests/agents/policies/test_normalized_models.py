@@ -11,11 +11,20 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from gymnasium import wrappers
-from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RescaleAction, TransformAction
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorWrapper
+from gymnasium.wrappers.vector import NormalizeReward, RescaleAction, TransformAction
+from gymnasium.wrappers.vector import TransformReward as VectorTransformReward
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 from agents import DQSpaceArmVecEnv, SB3VecEnv, compare, evaluate, export_policy
 from agents.policies.pickled_arrays import PickledError, as_array, read_pickled
@@ -77,6 +86,110 @@ def test_wrappers_of_single_environments_that_a_model_does_not_note_are_refused(
     as_policy(model)
     assert export_policy(model_in(rescaled)).action_scale.tolist() == [1.0] * 6  # which changes nothing
     as_policy(model_in(wrappers.FlattenObservation))
+
+
+class Negated(VecEnvWrapper):
+    """A wrapper of one's own for Stable-Baselines3, which changes observations."""
+
+    def reset(self):
+        return -self.venv.reset()
+
+    def step_wait(self):
+        seen, *rest = self.venv.step_wait()
+        return -seen, *rest
+
+
+class NegatedSingle(gymnasium.Wrapper):
+    """Likewise for a single environment, without saying that it is a wrapper of observations."""
+
+    def reset(self, **options):
+        seen, info = self.env.reset(**options)
+        return -seen, info
+
+    def step(self, action):
+        seen, *rest = self.env.step(action)
+        return -seen, *rest
+
+
+class NegatedVector(VectorWrapper):
+    """Likewise for a vector environment."""
+
+    reset, step = NegatedSingle.reset, NegatedSingle.step
+
+
+class Twofold(gymnasium.RewardWrapper):
+    """A wrapper of one's own that changes rewards alone."""
+
+    def reward(self, reward):
+        return 2.0 * reward
+
+
+def single_in(scene, *wrap):
+    env = gymnasium.make("DQSpaceArm-v0", scene=scene)
+    for each in wrap:
+        env = each(env)
+    return env
+
+
+def odd(env):
+    return wrappers.TransformAction(env, lambda action: action**3, env.action_space)  # the ends stay
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda scene: Negated(DQSpaceArmVecEnv(2, scene)), "Negated"),
+        (lambda scene: VecCheckNan(Negated(DQSpaceArmVecEnv(2, scene))), "Negated"),
+        (lambda scene: VecFrameStack(DQSpaceArmVecEnv(2, scene), 2), "VecFrameStack"),
+        (lambda scene: single_in(scene, NegatedSingle), "NegatedSingle"),
+        (lambda scene: single_in(scene, odd), "TransformAction"),
+        (lambda scene: wrapped(scene, NegatedVector), "NegatedVector"),
+        (lambda scene: held_by_processes(scene, NegatedSingle), "wrappers in other processes"),
+    ],
+)
+def test_wrappers_that_are_not_known_to_be_harmless_are_refused(make, name, small_scene):
+    environment = make(small_scene)
+    model = PPO("MlpPolicy", environment, n_steps=8, batch_size=8, device="cpu", policy_kwargs=dict(SMALL))
+    for way in (export_policy, as_policy):
+        with pytest.raises(ValueError, match=rf"the model's (observations or )?actions (may )?pass {name}"):
+            way(model)
+    model.get_env().close()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda scene: VecCheckNan(VecMonitor(DummyVecEnv([lambda: single_in(scene)]))),
+        lambda scene: single_in(scene, Twofold, wrappers.RecordEpisodeStatistics),
+        lambda scene: wrapped(scene, lambda env: VectorTransformReward(env, np.tanh), NormalizeReward),
+        lambda scene: held_by_processes(scene, wrappers.RecordEpisodeStatistics),
+    ],
+    ids=["Stable-Baselines3", "single", "vector", "processes"],
+)
+def test_wrappers_that_are_known_to_be_harmless_pass(make, small_scene):
+    environment = make(small_scene)
+    model = PPO("MlpPolicy", environment, n_steps=8, batch_size=8, device="cpu", policy_kwargs=dict(SMALL))
+    export_policy(model)
+    as_policy(model)
+    model.get_env().close()
+
+
+def held_by_processes(scene, *wrap):
+    """Environments in other processes, of which Gymnasium notes nothing."""
+    mode = AutoresetMode.SAME_STEP
+    return SB3VecEnv(AsyncVectorEnv([lambda: single_in(scene, *wrap)] * 2, autoreset_mode=mode))
+
+
+@pytest.mark.slow
+def test_processes_of_stable_baselines3_tell_which_wrappers_they_have(small_scene):
+    environment = SubprocVecEnv([lambda: single_in(small_scene, Twofold)] * 2)
+    model = PPO("MlpPolicy", environment, n_steps=8, batch_size=8, device="cpu")
+    as_policy(model)
+    environment.close()
+    environment = SubprocVecEnv([lambda: single_in(small_scene, NegatedSingle)])
+    with pytest.raises(PolicyError, match="pass wrappers in other processes"):
+        as_policy(PPO("MlpPolicy", environment, n_steps=8, batch_size=8, device="cpu"))
+    environment.close()
 
 
 @pytest.mark.parametrize("mode", ["sync", "async", pytest.param("subprocesses", marks=pytest.mark.slow)])
