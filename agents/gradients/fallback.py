@@ -58,8 +58,23 @@ class Fallback:
 
     def is_needed(self, median: float, warm: bool) -> bool:
         """Whether episodes with a median cost, or the recent ones if warmed up, have lost what there was."""
-        drifted = self.cost > DRIFTED * self.kept.cost or self.missing > self.kept.missing + LOST
-        return math.isinf(median) or (warm and (drifted or median > WORSE * self.cost))
+        return math.isinf(median) or (warm and (self._costs_more(median) or self._misses_more()))
+
+    def _costs_more(self, median: float) -> bool:
+        return self.cost > DRIFTED * self.kept.cost or median > WORSE * self.cost
+
+    def _misses_more(self) -> bool:
+        return self.missing > self.kept.missing + LOST
+
+    def pays_for_missing(self, median: float) -> str | None:
+        """What to tell where more episodes miss although they cost no more; None where that is not so."""
+        if math.isinf(median) or self._costs_more(median) or not self._misses_more():
+            return None
+        return (
+            f"the share of flights that miss rose from {self.kept.missing:.2f} to {self.missing:.2f}, again "
+            "and again: the cost pays for missing; lower cost.base_force or cost.base_torque, or raise "
+            "cost.terminal_pose"
+        )
 
     def go_back(self, median: float, other_costs: bool) -> None:
         """Go on from the kept copy, whose episodes have a median cost, by smaller steps.

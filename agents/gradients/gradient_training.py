@@ -201,6 +201,7 @@ class _Learner:
         if done % BETWEEN_DIVISIONS == 0 and not is_unstable and self._divide(median):
             gradient, median = self._fly(starts)
             is_unstable = fallback.is_needed(median, warm)
+        missing = fallback.pays_for_missing(median)
         if is_unstable:
             self._restore(fallback.kept.arrays)
             before = self._fly(starts)[1]
@@ -208,11 +209,11 @@ class _Learner:
         else:
             self._follow(gradient, median)
         if fallback.rate < LEAST_RATE:
-            raise DivergedError(
-                f"training diverged: at update {done + 1} flights cost {median:.4g} where they did "
-                f"{fallback.cost:.4g}, again and again; reduce algorithm.learning_rate = "
-                f"{settings.learning_rate:g}"
+            reason = missing or (
+                f"flights cost {median:.4g} where they did {fallback.cost:.4g}, again and again; reduce "
+                f"algorithm.learning_rate = {settings.learning_rate:g}"
             )
+            raise DivergedError(f"training diverged: at update {done + 1} {reason}")
         self._updates += 1
         return median
 

@@ -14,7 +14,7 @@ from agents.configuration.schema import Network
 from agents.gradients import first_units, gradient_training
 from agents.gradients.first_units import motions
 from agents.gradients.gradient_training import train_by_gradients
-from agents.run_folder import RunFolder, RunFolderError, validation_seeds
+from agents.run_folder import DivergedError, RunFolder, RunFolderError, validation_seeds
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene
 from dq_space_arm_env.environment.rollouts import rollout
 
@@ -302,6 +302,26 @@ def test_what_drifts_goes_back_to_a_copy(small_file, small_scene, what):
     assert fallback.rate < rate
     assert fallback.cost <= fallback.kept.cost
     assert fallback.missing <= fallback.kept.missing
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("costs", r"at update 62 flights cost \d.* where they did \d.*; reduce algorithm.learning_rate = 0"),
+        ("misses", r"at update 62 the share of flights that miss rose from 0.30 to 0.65, again and again"),
+    ],
+)
+def test_a_training_that_gives_up_says_what_was_lost(small_file, small_scene, what, said):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    for _ in range(61):  # the integration is not measured now
+        learner._update()
+    fallback = learner._fallback
+    fallback.rate = 1e-3
+    if what == "costs":
+        fallback.kept.cost = fallback.cost / 1.6
+    fallback.kept.missing, fallback.missing = 0.3, 0.65
+    with pytest.raises(DivergedError, match=f"training diverged: {said}"):
+        learner._update()
 
 
 @pytest.mark.parametrize(
