@@ -86,6 +86,8 @@ class Evaluation:
     def __repr__(self) -> str:
         rate, gap = self.success_rate.value, self.median_cost_gap.value
         beside = "" if np.isnan(gap) else f", median cost gap {100.0 * gap:.3g} %"
+        if failed := int(self.flights.policy_failed.sum()):
+            beside += f"; the policy failed (gave NaN) in {failed} of {len(self.seeds)} flights"
         return (
             f"<Evaluation of {self.policy} in {self.scene!r}, {self.condition}: {len(self.seeds)} flights, "
             f"{100.0 * rate:.3g} % reach the target{beside}>"

@@ -84,6 +84,7 @@ def test_a_policy_that_gives_nan_is_no_success():
     scene = SHORT.replace(success={"attitude_error_deg": 180.0, "position_error": 100.0})
     evaluation = evaluate(lambda seen: np.full((len(seen), 12), np.nan), scene, 3, expert=False)
     assert evaluation.summary()["policy_failed"] == 3
+    assert "0 % reach the target; the policy failed (gave NaN) in 3 of 3 flights>" in repr(evaluation)
     assert evaluation.summary()["success_rate"][0] == 0.0
     (remark,) = remarks([evaluation])
     assert remark.startswith("<lambda>, training: in 3 flights the policy gave NaN")
