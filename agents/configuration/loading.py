@@ -108,7 +108,13 @@ def _read(file: Traversable) -> AgentConfiguration:
     try:
         # A package in a zip file has its configurations there.
         data = read_yaml(file) if isinstance(file, Path) else parse_yaml(file.read_text(encoding="utf-8"))
-        return _of_its_class(mapping_at_top(file, data), str(file))
+        content = mapping_at_top(file, data)
+        if "links" in content and "algorithm" not in content:
+            raise ConfigurationError(
+                f"{file} is a scene, should be a configuration of an agent; to train for the scene: "
+                f"dq-space-arm train apg --scene {file}"
+            )
+        return _of_its_class(content, str(file))
     except UnreadableError as error:
         raise ConfigurationError(str(error)) from error
     except YAMLError as error:

@@ -212,7 +212,14 @@ def test_what_cannot_be_found_or_read_is_named(tmp_path):
         load_configuration("pppo")
     with pytest.raises(ConfigurationError, match=r"nothing\.yaml: there is no such file"):
         load_configuration(tmp_path / "nothing.yaml")
-    for content, sentence in (("a: [", "not valid YAML"), ("- 1", "must be a mapping")):
+    for content, sentence in (
+        ("a: [", "not valid YAML"),
+        ("- 1", "must be a mapping"),
+        (
+            "name: mine\nbase: {}\nlinks: []",
+            r"is a scene, should be .*: dq-space-arm train apg --scene /.*odd",
+        ),
+    ):
         (tmp_path / "odd.yaml").write_text(content)
         with pytest.raises(ConfigurationError, match=sentence):
             load_configuration(tmp_path / "odd.yaml")
