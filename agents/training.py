@@ -60,6 +60,7 @@ def train(
         raise ImportError(f'training needs {error.name}: pip install "dq-space-arm[agents]"') from error
     from agents.run_folder import reserved
 
+    load_scene(checked.scene)  # or a scene that is not there would leave a folder behind
     with reserved(folder):
         return run()
 

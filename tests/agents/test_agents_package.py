@@ -9,6 +9,8 @@ import agents.imitation
 import agents.policies
 import dq_space_arm_env
 import experts
+from agents.configuration import load_configuration
+from agents.training import with_changes
 
 EXTRA = ("stable_baselines3", "torch")
 
@@ -29,6 +31,14 @@ def test_the_command_names_what_is_missing_in_a_sentence(run_without, tmp_path):
     done = run_without(EXTRA, TRAINING, tmp_path / "run")
     assert done.returncode == 2
     assert re.fullmatch(r'Error: training needs \w+: pip install "dq-space-arm\[agents\]"\n', done.stderr)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_scene_that_is_not_there_leaves_no_folder(tmp_path):
+    pytest.importorskip("threadpoolctl")
+    configuration = with_changes(load_configuration("apg"), scene=str(tmp_path / "nothing.yaml"))
+    with pytest.raises(dq_space_arm_env.SceneError, match=r"nothing\.yaml: there is no such file"):
+        agents.train(configuration, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
