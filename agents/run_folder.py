@@ -188,6 +188,11 @@ def validation_seeds(episodes: int) -> list[int]:
     return [int(seed) for seed in np.random.SeedSequence(VALIDATION_SEED).generate_state(episodes)]
 
 
+def starts_alike(scene: Scene) -> bool:
+    """Whether all episodes of a scene start alike, since nothing is drawn."""
+    return not any(scene.spread.model_dump(exclude={"observed"}).values())
+
+
 def validate(policy: Policy | StateFeedback, scene: Scene, seeds: Sequence[int]) -> dict[str, float]:
     """Fly a policy for the learning curve: success rate, and medians of cost and final errors (deg, m).
 

@@ -1,6 +1,7 @@
 """Training from a configuration."""
 
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -60,9 +61,21 @@ def train(
         raise ImportError(f'training needs {error.name}: pip install "dq-space-arm[agents]"') from error
     from agents.run_folder import reserved
 
-    load_scene(checked.scene)  # or a scene that is not there would leave a folder behind
+    warn_of_equal_starts(checked)  # or a scene that is not there would leave a folder behind
     with reserved(folder):
         return run()
+
+
+def warn_of_equal_starts(configuration: AgentConfiguration) -> None:
+    """Warn where nothing is drawn in the scene of a configuration; SceneError if it cannot be loaded."""
+    from agents.run_folder import starts_alike
+
+    if starts_alike(scene := load_scene(configuration.scene)):
+        warnings.warn(
+            f"scene {scene.name!r} has no spread, so all episodes start alike: the policy learns to fly from "
+            "this start alone; give the scene a spread for others",
+            stacklevel=3,
+        )
 
 
 def is_trained(configuration: AgentConfiguration, folder: Path) -> bool:

@@ -82,13 +82,18 @@ class FlightDisturbance(NamedTuple):
     noise: float = 0.0  # standard deviation of the measured state, rad, m, rad/s, m/s
     push: float = 0.0  # standard deviation along each axis of the base's jumps in velocity, rad/s, m/s
 
+    @property
+    def is_drawn(self) -> bool:
+        """Whether flights from one start differ."""
+        return bool(self.noise or self.push)
+
     def steps(self, scene: Scene) -> int:
         """Whole time steps of the delay, at least 1 if there is any."""
         return max(round(self.delay / scene.simulation.dt), 1) if self.delay else 0
 
     def drawn(self, scene: Scene, flights: Sequence[int], of: int, seed: int) -> "Disturbances | None":
         """Noise and pushes of some of many flights; those of a flight depend on its number alone."""
-        if not (self.noise or self.push):
+        if not self.is_drawn:
             return None
         settings = {"measurement": self.noise or None, "push": self.push or None, "pushes": PUSHES}
         return ChosenDisturbances(flights, scene, np.random.default_rng([seed, 1]), count=of, **settings)

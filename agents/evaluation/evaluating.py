@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,6 +31,7 @@ from agents.evaluation.statistics import (
 )
 from agents.policies.flying import Flights, Policy, fly, from_json_list, json_list, time_per_action
 from agents.policies.policy_files import noted_effort
+from agents.run_folder import starts_alike
 from agents.zoo.finding import as_policy, check_fit
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
@@ -282,6 +284,12 @@ def evaluate(
             workers=workers,
             executor=executor,
             progress=lambda done, total: progress(Advance(STAGE, done, total)),
+        )
+    elif n > 1 and starts_alike(flown) and not disturbance_under(condition).is_drawn:
+        warnings.warn(
+            f"scene {given.name!r} has no spread, so all {n} flights are the same, and their intervals tell "
+            "nothing of other starts: give it a spread, or set n = 1",
+            stacklevel=2,
         )
     started = perf_counter()
     flights = fly_under(

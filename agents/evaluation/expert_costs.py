@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from agents.configuration.schema import RESERVED_SEED
 from agents.evaluation.kept_results import CachedGroups, Row
-from agents.run_folder import VALIDATION_SEED, validation_seeds
+from agents.run_folder import VALIDATION_SEED, starts_alike, validation_seeds
 from dq_space_arm_env import Scene
 from experts.demonstrations.outcomes import MISSED_TARGET, REASONS
 from experts.demonstrations.settings import Settings, software
@@ -145,7 +145,7 @@ def _look_up(
 
 def evaluation_settings(scene: Scene) -> Settings:
     """Settings of demonstrations from the evaluation starts; ValueError if the scene does not suit them."""
-    if not any(scene.spread.model_dump().values()):
+    if starts_alike(scene):
         raise ValueError(
             f"scene {scene.name!r} has no spread, so all evaluation starts are the same: give it a spread, "
             "or evaluate without the expert (expert=False, --no-expert)"

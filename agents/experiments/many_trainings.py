@@ -17,8 +17,7 @@ from agents.evaluation.comparison_tables import COLUMNS
 from agents.evaluation.statistics import interquartile_mean
 from agents.experiments.shared_demonstrations import SharedDemonstrations
 from agents.experiments.training_task import FAILED, TRAINED, TrainingTask
-from agents.training import default_folder, is_trained, with_changes
-from dq_space_arm_env import load_scene
+from agents.training import default_folder, is_trained, warn_of_equal_starts, with_changes
 from dq_space_arm_env.common.host_machine import processors
 from dq_space_arm_env.common.progress import Advance, Status
 from dq_space_arm_env.common.tables import Column, Row, TextTable, tabulate
@@ -150,7 +149,7 @@ def train_seeds(
         )
     tasks = []
     for each in configurations:
-        load_scene(each.scene)
+        warn_of_equal_starts(each)
         begin = each.seed if first is None else first
         tasks += [training_task(with_changes(each, seed=begin + i), out) for i in range(count)]
     chosen = executor or training_executor(configurations)

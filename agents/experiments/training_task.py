@@ -6,6 +6,7 @@ import json
 import math
 import platform
 import traceback
+import warnings
 from contextlib import chdir, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -142,5 +143,7 @@ class TrainingTask(NamedTuple):
         )
         with locked(self.folder / LOCK, refusal, seconds=PATIENCE):
             pass
-        train(self.configuration, self.folder, report=report)
+        with warnings.catch_warnings():  # told once, where the trainings were asked for
+            warnings.filterwarnings("ignore", "scene .* has no spread")
+            train(self.configuration, self.folder, report=report)
         (self.folder / PROGRESS).unlink(missing_ok=True)

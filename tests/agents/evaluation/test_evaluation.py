@@ -90,6 +90,18 @@ def test_a_policy_that_gives_nan_is_no_success():
     assert remark.startswith("<lambda>, training: in 3 flights the policy gave NaN")
 
 
+def test_flights_that_all_start_alike_are_told():
+    still = SHORT.replace(spread=dict.fromkeys(SHORT.spread.model_dump(exclude={"observed"}), 0.0))
+    with pytest.warns(UserWarning, match=r"scene 'short' has no spread, so all 3 flights are the same"):
+        found = evaluate(gentle, still, 3, expert=False)
+    assert len(set(found.flights.cost.tolist())) == 1
+    with pytest.raises(ValueError, match=r"no spread, so all evaluation starts are the same"):
+        evaluate(gentle, still, 3)
+    evaluate(gentle, still, 1, expert=False)  # without a warning
+    pushed = evaluate(gentle, still, 3, condition="push", expert=False)
+    assert len(set(pushed.flights.cost.tolist())) == 3
+
+
 def test_evaluation_seeds_are_fixed_and_their_own():
     seeds = evaluation_seeds(PAPER)
     assert len(set(seeds)) == EVALUATION_SEEDS == 500

@@ -8,15 +8,18 @@ import pytest
 
 pytest.importorskip("threadpoolctl")
 
+from agents import train
 from agents.configuration import ConfigurationError, load_configuration
 from agents.configuration.gradients import FlightMismatch
 from agents.configuration.schema import Network
+from agents.experiments.many_trainings import train_seeds
 from agents.gradients import first_units, gradient_training
 from agents.gradients.first_units import motions
 from agents.gradients.gradient_training import train_by_gradients
 from agents.run_folder import DivergedError, RunFolder, RunFolderError, validation_seeds
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene
 from dq_space_arm_env.environment.rollouts import rollout
+from experts.demonstrations import SerialExecutor
 
 pytestmark = pytest.mark.agents
 
@@ -339,6 +342,20 @@ def test_copies_are_taken_while_costs_and_misses_stay(small_file, small_scene, f
     learner._update()
     found = fallback.newer.arrays["weight0"], fallback.kept.arrays["weight0"]
     np.testing.assert_array_equal(found, before[:2] if taken else before[1:])
+
+
+@pytest.mark.slow
+def test_episodes_that_all_start_alike_are_told_once(small_scene, tmp_path):
+    nothing = dict.fromkeys(small_scene.spread.model_dump(exclude={"observed"}), 0.0)
+    small_scene.replace(name="still", spread=nothing).to_yaml(tmp_path / "still.yaml")
+    given = settings(tmp_path / "still.yaml", updates=2)
+    said = r"scene 'still' has no spread, so all episodes start alike: the policy learns to fly from this"
+    with pytest.warns(UserWarning, match=said):
+        train(given, tmp_path / "alone")
+    with pytest.warns(UserWarning, match=said) as told:
+        rows = train_seeds([given], 2, tmp_path / "runs", executor=SerialExecutor())
+    assert [row["outcome"] for row in rows] == ["trained"] * 2
+    assert len(told) == 1
 
 
 def test_training_starts_from_a_policy(small_file, tmp_path):
