@@ -186,8 +186,13 @@ def catch_rows(catch: Catch) -> Iterator[tuple[str, str, str]]:
         yield f"  {name}", error, note
 
 
-def error_rows(success: Success, errors: Sequence[float]) -> Iterator[tuple[str, str, str]]:
-    """Rows of a table: errors at the end in the order of the tolerances, and these."""
+def error_rows(
+    success: Success, errors: Sequence[float], condition: str = ""
+) -> Iterator[tuple[str, str, str]]:
+    """Rows of a table: errors at the end in the order of the tolerances, and whether each is within its own.
+
+    `condition` is what these verdicts hold under, such as " as if caught".
+    """
     names = (
         ("attitude error", "deg"),
         ("position error", "m"),
@@ -196,7 +201,9 @@ def error_rows(success: Success, errors: Sequence[float]) -> Iterator[tuple[str,
     )
     for (name, unit), error, most in zip(names, errors, success.tolerances, strict=False):
         notes = ["relative to the target"] if "velocity" in name else []
-        notes += [f"tolerance {most:g} {unit}"] if math.isfinite(most) else []
+        if math.isfinite(most):
+            verdict = "within" if error <= most else "NOT within"
+            notes.append(f"{verdict} the tolerance of {most:g} {unit}{condition}")
         yield name, f"{error:.3g} {unit}", "; ".join(notes)
 
 

@@ -172,7 +172,6 @@ def table(run: SolveRun) -> ConsoleRenderable:
     """Describe a run for people."""
     solution = run.solution
     verdict = "converged" if solution.converged else f"NOT converged ({solution.stop_reason.value})"
-    reached = "within the tolerance" if run.ends_within else "NOT within the tolerance"
     guess = str(solution.metadata.get("guess", "zero controls"))
     if guess.startswith("policy"):
         guess = "the prepared maneuver, with its feedback gains"
@@ -186,14 +185,14 @@ def table(run: SolveRun) -> ConsoleRenderable:
         seconds += f", after {sum(attempt['iterations'] for attempt in long_steps)} in long steps"
     if solution.converged and solution.iterations == 0:
         seconds += ": the initial guess is already optimal"
-    led = ""
+    led, condition = "", ""
     if solution.constraints is not None and not run.scene.constraints:
         led = "the tolerances are constraints: the cheapest maneuver would miss the target"
     elif not run.ends_within and any(each["constrained"] for each in solution.metadata.get("attempts", ())):
         led = "of the cheapest maneuver; none that reaches the target was found"
     if not ends_held(run.catches):
         led = "; ".join(filter(None, (AS_IF_CAUGHT, led)))
-        reached = f"{reached} as if caught"
+        condition = " as if caught"
     rows = [
         ("start", run.start.title, ""),
         ("preparation", f"{run.preparation_seconds:.1f} s", prepared),
@@ -202,11 +201,10 @@ def table(run: SolveRun) -> ConsoleRenderable:
         ("end", verdict, solution.message),
         ("iterations", str(solution.iterations), seconds),
     ]
-    (name, error, tolerance), *others = error_rows(run.scene.success, run.final_errors)
     for catch in run.catches:
         rows += catch_rows(catch)
         rows += [] if catch.is_met else [("  to meet it", "", TO_CATCH)]
-    rows += [(name, error, f"{tolerance}; {reached}"), *others]
+    rows += error_rows(run.scene.success, run.final_errors, condition)
     if not run.ends_within and math.isfinite(solution.cost):
         rows += _spared(Maneuver(run.start.episode_scene, solution.states, solution.controls))
     return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)

@@ -1,6 +1,7 @@
 """The verbs `solve` and `simulate`: what they print, write, and how they end."""
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ from dq_space_arm_env.command_line.policy_sources import load_policy
 from dq_space_arm_env.command_line.simulated_episode import (
     begin,
     drowned_inputs,
+    error_rows,
     flown_catches,
     fly,
     read_noise,
     read_state,
 )
 from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, UNUSABLE
+from dq_space_arm_env.scene.maneuver import Success
 from dq_space_arm_env.task.trajectory import Trajectory
 from experts import Solution
 from experts.problems.arm_problem import ArmProblem
@@ -129,8 +132,20 @@ def test_a_maneuver_that_misses_names_the_inputs_that_it_hardly_uses(
     ):
         main([*arguments, *more])
         table = " ".join(capsys.readouterr().out.split())
-        assert "NOT within the tolerance" in table
+        assert re.search(r"position error [\d.]+ m NOT within the tolerance of 0.\d+ m", table)
         assert hint in table if hint else "hardly used" not in table
+
+
+def test_each_error_is_within_its_own_tolerance_or_not() -> None:
+    success = Success(attitude_error_deg=3.0, position_error=1e-12, velocity_error=0.1)
+    assert list(error_rows(success, (0.0194, 0.0385, 7.0, 0.1))) == [
+        ("attitude error", "0.0194 deg", "within the tolerance of 3 deg"),
+        ("position error", "0.0385 m", "NOT within the tolerance of 1e-12 m"),
+        ("angular velocity", "7 deg/s", "relative to the target"),
+        ("velocity", "0.1 m/s", "relative to the target; within the tolerance of 0.1 m/s"),
+    ]
+    *_, position = error_rows(Success(), (math.nan, math.inf), " as if caught")
+    assert position == ("position error", "inf m", "NOT within the tolerance of 0.1 m as if caught")
 
 
 def test_a_solve_shows_what_it_prepares_and_what_it_solves(
@@ -320,7 +335,7 @@ def test_a_plan_that_misses_its_catch_is_no_success(
     assert re.search(r"end +converged", table)
     assert re.search(r"cost J +[\d.]+ +as if the payload were caught; ", table)
     assert re.search(r"to meet it +let the robot coast", table)
-    assert re.search(r"within the tolerance as if\s+caught", table)
+    assert re.search(r"attitude error .* within the tolerance of [\d.]+ deg as if\s+caught", table)
     assert main(["simulate", "short.yaml", "--policy", "zero"]) == SUCCESS
     assert "MISSED" in capsys.readouterr().out
 
