@@ -186,18 +186,21 @@ def table(run: SolveRun) -> ConsoleRenderable:
     if solution.converged and solution.iterations == 0:
         seconds += ": the initial guess is already optimal"
     led, condition = "", ""
-    if solution.constraints is not None and not run.scene.constraints:
+    is_led = solution.constraints is not None and not run.scene.constraints
+    if is_led:
         led = "the tolerances are constraints: the cheapest maneuver would miss the target"
     elif not run.ends_within and any(each["constrained"] for each in solution.metadata.get("attempts", ())):
         led = "of the cheapest maneuver; none that reaches the target was found"
     if not ends_held(run.catches):
         led = "; ".join(filter(None, (AS_IF_CAUGHT, led)))
         condition = " as if caught"
+    maneuver = Maneuver(run.start.episode_scene, solution.states, solution.controls)
     rows = [
         ("start", run.start.title, ""),
         ("preparation", f"{run.preparation_seconds:.1f} s", prepared),
         ("solver", run.solver, f"initial guess: {guess}"),
         ("cost J", f"{solution.cost:.6f}", led),
+        *([_dearest(maneuver)] if is_led else []),
         ("end", verdict, solution.message),
         ("iterations", str(solution.iterations), seconds),
     ]
@@ -206,8 +209,15 @@ def table(run: SolveRun) -> ConsoleRenderable:
         rows += [] if catch.is_met else [("  to meet it", "", TO_CATCH)]
     rows += error_rows(run.scene.success, run.final_errors, condition)
     if not run.ends_within and math.isfinite(solution.cost):
-        rows += _spared(Maneuver(run.start.episode_scene, solution.states, solution.controls))
+        rows += _spared(maneuver)
     return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)
+
+
+def _dearest(maneuver: Maneuver) -> tuple[str, str, str]:
+    """The actuator that takes most of the cost: its weight keeps the cheapest maneuver from the target."""
+    dearest = max(maneuver.actuators, key=lambda actuator: actuator.effort)
+    helps = f"a smaller cost.{dearest.name}, or a larger cost.terminal_pose, leads that one nearer"
+    return f"  {dearest.name}", f"{dearest.effort:.6f}", f"the dearest input: {helps}"
 
 
 def _spared(maneuver: Maneuver) -> Iterator[tuple[str, str, str]]:

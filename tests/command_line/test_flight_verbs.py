@@ -136,6 +136,21 @@ def test_a_maneuver_that_misses_names_the_inputs_that_it_hardly_uses(
         assert hint in table if hint else "hardly used" not in table
 
 
+@pytest.mark.slow
+def test_a_target_that_the_cheapest_maneuver_would_miss_names_the_dearest_input(
+    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = {"target.pose.position": [0.75, 0.7, 0.0], "cost.base_force": 100.0}
+    dear = scene.replace({"actuators.base_force": {"limit": 10.0}, **far})
+    dear.to_yaml(tmp_path / "dear.yaml")
+    assert main(["solve", str(tmp_path / "dear.yaml"), "--out", str(tmp_path / "out")]) == SUCCESS
+    table = " ".join(capsys.readouterr().out.split())
+    assert "constraints: the cheapest maneuver would miss the target" in table
+    assert "the dearest input: a smaller cost.base_force, or a larger cost.terminal_pose, leads" in table
+    solution = Solution.load(tmp_path / "out" / "solution.npz")
+    assert f" base_force {100.0 * (solution.controls[:, :2] ** 2).sum():.6f} the dearest input" in table
+
+
 def test_each_error_is_within_its_own_tolerance_or_not() -> None:
     success = Success(attitude_error_deg=3.0, position_error=1e-12, velocity_error=0.1)
     assert list(error_rows(success, (0.0194, 0.0385, 7.0, 0.1))) == [
