@@ -1,4 +1,4 @@
-"""What is valid in a scene and probably not meant: units, masses, limits, targets out of reach."""
+"""What is valid in a scene and probably not meant: units, masses, limits, targets out of reach, no draws."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the effor
 
 def warnings_of(scene: Scene) -> list[str]:
     """List what is unwise in a valid scene, a sentence each, which names the key and says what would help."""
-    checks = (_names, _units, _masses, limit_warnings, _start, _times, _reach, _caught)
+    checks = (_names, _units, _masses, limit_warnings, _start, _draws, _times, _reach, _caught)
     return [sentence for check in checks for sentence in check(scene)]
 
 
@@ -196,6 +196,16 @@ def _start(scene: Scene) -> Iterator[str]:
         if float(c) > row.tolerance
     ]
     yield from (f"initial_state: constraint {sentence}" for sentence in _together(violated))
+
+
+def _draws(scene: Scene) -> Iterator[str]:
+    """Episodes that are all the same."""
+    if not any(scene.spread.model_dump().values()):
+        width = "joint_angles: 0.2" if freedoms(scene.links) else "base_rotation: 0.2"
+        yield (
+            "spread: there is none, so all episodes begin alike, and agents see one start: give widths, such "
+            f"as {width} (rad)"
+        )
 
 
 def _times(scene: Scene) -> Iterator[str]:

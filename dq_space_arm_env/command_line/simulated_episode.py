@@ -64,7 +64,8 @@ def begin(scene: Scene, seed: int | None = None, given: str | NDArray[np.float64
     env = DQSpaceArmEnv(scene)
     if seed is not None:
         env.reset(seed=seed)
-        title = f"drawn with seed {seed}"
+        drawn = any(scene.spread.model_dump().values())
+        title = f"drawn with seed {seed}" if drawn else f"{OWN}, which has no spread to draw from"
     else:
         state = read_state(given, env.kernels.n_x) if isinstance(given, str) else given
         try:

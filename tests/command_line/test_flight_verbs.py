@@ -69,6 +69,14 @@ def test_solve_writes_what_it_says(solved: Path, scene: Scene) -> None:
     assert info["position_error"] == pytest.approx(summary["final_position_error_m"])
 
 
+def test_a_seed_draws_nothing_without_spread(short_scene: Scene) -> None:
+    start = begin(short_scene, 1)
+    assert start.title == "the scene's own, which has no spread to draw from"
+    assert start.state.tolist() == begin(short_scene).state.tolist()
+    moved = short_scene.replace(spread={"target_position": 0.1})
+    assert begin(moved, 1).title == "drawn with seed 1"
+
+
 def test_solve_prints_table_or_json(
     scene_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

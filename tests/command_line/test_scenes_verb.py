@@ -279,6 +279,17 @@ def test_the_unwise_is_warned_of(change: dict[str, object], sentence: str) -> No
     assert any(re.match(sentence, each) for each in found), found
 
 
+def test_episodes_that_all_begin_alike_are_warned_of() -> None:
+    same = "spread: there is none, so all episodes begin alike, and agents see one start:"
+    scene = load_scene("no-wrist").replace(spread=Spread())
+    assert warnings_of(scene) == [f"{same} give widths, such as joint_angles: 0.2 (rad)"]
+    assert warnings_of(scene.replace(spread={"target_position": 0.1})) == []
+    body = {"mass": 50.0, "inertia": [3, 3, 3]}
+    force = {"base_force": {"limit": 10.0}, "base_torque": {"limit": 2.0}}
+    alone = load_scene({"name": "body", "base": body, "actuators": force, "target": {"pose": {}}})
+    assert warnings_of(alone) == [f"{same} give widths, such as base_rotation: 0.2 (rad)"]
+
+
 def test_goals_of_other_tips_out_of_reach_are_warned_of_too() -> None:
     far = "m from the center of mass, from which the arm reaches 2.52 m: it is out of reach$"
     scene = load_scene("dual-arm").replace({"actuators.base_force": None})
