@@ -46,7 +46,7 @@ _TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the effor
 
 def warnings_of(scene: Scene) -> list[str]:
     """List what is unwise in a valid scene, a sentence each, which names the key and says what would help."""
-    checks = (_names, _units, _masses, limit_warnings, _start, _draws, _times, _reach, _caught)
+    checks = (_names, _units, _masses, _actuators, limit_warnings, _start, _draws, _times, _reach, _caught)
     return [sentence for check in checks for sentence in check(scene)]
 
 
@@ -153,6 +153,23 @@ def _together(found: Iterable[tuple[str, str]]) -> Iterator[str]:
     if places:
         others = ", ".join(place for place, _ in places[1:])
         yield ": ".join(places[0]) + (f" Likewise {others}" if others else "")
+
+
+def _actuators(scene: Scene) -> Iterator[str]:
+    """Scenes that the environment, and without any actuator also the expert, refuses."""
+    layout = StateLayout.of(scene)
+    if not layout.n_u:
+        yield (
+            "actuators: there is none, so there is nothing to solve or to learn: give one, such as "
+            "base_torque: {limit: 2.0} (N m)"
+        )
+    limits = zip(layout.control.names, layout.control_limit, strict=True)
+    unlimited = [name for name, limit in limits if math.isinf(limit)]
+    if unlimited:
+        yield (
+            f"actuators: {', '.join(unlimited)} without a finite limit: the environment refuses the scene, "
+            "and nothing learns in it"
+        )
 
 
 def limit_warnings(scene: Scene) -> Iterator[str]:

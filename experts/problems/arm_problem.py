@@ -391,7 +391,13 @@ def as_problem(scene_or_problem: Any) -> ShootingProblem:
     Raises TypeError for what is neither, and ValueError for a problem that contradicts itself.
     """
     if isinstance(scene_or_problem, Scene | str | Path | Mapping):
-        problem: ShootingProblem = ArmProblem(scene_or_problem)
+        arm = ArmProblem(scene_or_problem)
+        if not arm.n_controls:
+            raise ValueError(
+                f"scene {arm.scene.name!r} has no actuator; give it one with a finite limit, such as "
+                "actuators: {base_torque: {limit: 2.0}}"
+            )
+        problem: ShootingProblem = arm
     else:
         check_interface(scene_or_problem)
         problem = scene_or_problem

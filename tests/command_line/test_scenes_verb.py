@@ -1,6 +1,7 @@
 """The verb `scenes`: lists, summaries, problems with their lines, and new files that are valid."""
 
 import json
+import math
 import re
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from dq_space_arm_env.command_line.scene_summary import left_out
 from dq_space_arm_env.command_line.scene_template import commented_yaml
 from dq_space_arm_env.command_line.scene_warnings import warnings_of
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, UNUSABLE
-from dq_space_arm_env.scene import Spread, StateLayout
+from dq_space_arm_env.scene import Actuators, Spread, StateLayout
 from dq_space_arm_env.validation import parse_yaml
 
 BROKEN = """\
@@ -288,6 +289,17 @@ def test_episodes_that_all_begin_alike_are_warned_of() -> None:
     force = {"base_force": {"limit": 10.0}, "base_torque": {"limit": 2.0}}
     alone = load_scene({"name": "body", "base": body, "actuators": force, "target": {"pose": {}}})
     assert warnings_of(alone) == [f"{same} give widths, such as base_rotation: 0.2 (rad)"]
+
+
+def test_scenes_that_environments_refuse_are_warned_of() -> None:
+    scene = load_scene("no-wrist")
+    (none,) = warnings_of(scene.replace(actuators=Actuators()))
+    assert none.startswith("actuators: there is none, so there is nothing to solve or to learn: give one")
+    changes = {"actuators.base_torque.limit": [1.0, math.inf, 1.0], "links.1.torque_limit": math.inf}
+    assert warnings_of(scene.replace(changes)) == [
+        "actuators: base torque y, link 2 torque without a finite limit: the environment refuses the scene, "
+        "and nothing learns in it"
+    ]
 
 
 def test_goals_of_other_tips_out_of_reach_are_warned_of_too() -> None:

@@ -484,6 +484,13 @@ def test_problem_that_contradicts_itself_is_refused(pendulum, changes, message):
         BoxDDP(replace(pendulum, **changes))
 
 
+def test_a_scene_without_actuators_is_refused():
+    body = {"name": "body", "base": {"mass": 50, "inertia": [3, 3, 3]}, "target": {"pose": {}}}
+    for solver in (BoxDDP, GuidedDDP):
+        with pytest.raises(ValueError, match="scene 'body' has no actuator; give it one with a finite limit"):
+            solver(body)
+
+
 def test_input_without_a_weight_is_refused(pendulum):
     derivatives = pendulum.cost_derivatives
     free = replace(pendulum, cost_derivatives=lambda x, u: (*derivatives(x, u)[:3], np.zeros((1, 1))))
