@@ -46,7 +46,12 @@ _TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the effor
 
 def warnings_of(scene: Scene) -> list[str]:
     """List what is unwise in a valid scene, a sentence each, which names the key and says what would help."""
-    checks = (_names, _units, _masses, _actuators, limit_warnings, _start, _draws, _times, _reach, _caught)
+    return [*maneuver_warnings(scene), *_draws(scene)]
+
+
+def maneuver_warnings(scene: Scene) -> list[str]:
+    """Those of them that may tell why a maneuver misses its target."""
+    checks = (_names, _units, _masses, _actuators, limit_warnings, _start, _times, _reach, _caught)
     return [sentence for check in checks for sentence in check(scene)]
 
 
@@ -215,16 +220,6 @@ def _start(scene: Scene) -> Iterator[str]:
     yield from (f"initial_state: constraint {sentence}" for sentence in _together(violated))
 
 
-def _draws(scene: Scene) -> Iterator[str]:
-    """Episodes that are all the same."""
-    if not any(scene.spread.model_dump().values()):
-        width = "joint_angles: 0.2" if freedoms(scene.links) else "base_rotation: 0.2"
-        yield (
-            "spread: there is none, so all episodes begin alike, and agents see one start: give widths, such "
-            f"as {width} (rad)"
-        )
-
-
 def _times(scene: Scene) -> Iterator[str]:
     """Steps of seconds, episodes that are too short for the way, and tolerances that are as long."""
     simulation = scene.simulation
@@ -340,6 +335,16 @@ def _caught(scene: Scene) -> Iterator[str]:
             "target.motion.inertia: not in the ratios of payload.inertia, turned by target.grasp: the body "
             "tumbles as another than is caught, and the momentum of that one changes without a torque; "
             f"{found} is the payload's"
+        )
+
+
+def _draws(scene: Scene) -> Iterator[str]:
+    """Episodes that are all the same."""
+    if not any(scene.spread.model_dump().values()):
+        width = "joint_angles: 0.2" if freedoms(scene.links) else "base_rotation: 0.2"
+        yield (
+            "spread: there is none, so all episodes begin alike, and agents see one start: give widths, such "
+            f"as {width} (rad)"
         )
 
 

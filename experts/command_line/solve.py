@@ -8,7 +8,14 @@ import click
 
 from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option
 from dq_space_arm_env.command_line.verb import Interrupted, json_option
-from dq_space_arm_env.common.console import FAILURE, SUCCESS, message_console, print_document, table_console
+from dq_space_arm_env.common.console import (
+    FAILURE,
+    SUCCESS,
+    complain,
+    message_console,
+    print_document,
+    table_console,
+)
 from dq_space_arm_env.common.files import check_writable_file
 
 
@@ -57,6 +64,7 @@ def solve(
     After the preparation the best trajectory so far is always saved, flagged as not converged.
     """
     from dq_space_arm_env import load_scene
+    from dq_space_arm_env.command_line.scene_warnings import maneuver_warnings
     from dq_space_arm_env.dynamics.step_stability import advice
     from dq_space_arm_env.environment.catches import ends_held
     from experts.command_line import solving
@@ -78,6 +86,9 @@ def solve(
         guided=solver == "guided",
         max_iterations=max_iterations,
     )
+    if not run.ends_within:
+        for warning in maneuver_warnings(loaded):
+            complain(warning, label="Warning: ")
     files = solving.save(run, folder, figures=figures)
     record = {**solving.record(run), "files": [str(file) for file in files]}
     if as_json:

@@ -69,6 +69,21 @@ def test_solve_writes_what_it_says(solved: Path, scene: Scene) -> None:
     assert info["position_error"] == pytest.approx(summary["final_position_error_m"])
 
 
+def test_a_solve_that_misses_says_what_is_unwise_in_the_scene(
+    scene_file: str, short_scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = short_scene.replace({"target.pose.position": [100.0, 0.0, 0.0]})
+    far.to_yaml(tmp_path / "far.yaml")
+    words = ["--solver", "box", "--max-iterations", "1", "--out", str(tmp_path / "out"), "--json"]
+    main(["solve", str(tmp_path / "far.yaml"), *words])
+    shown = " ".join(capsys.readouterr().err.split())
+    assert re.search(r"Warning: simulation.steps: an episode of 3 s for 9\d.\d m and 60 degrees", shown)
+    assert re.search(r"Warning: target: 9\d.\d m from the center of mass, .*: it is out of reach", shown)
+    assert "spread" not in shown  # which has no say
+    main(["solve", scene_file, *words[:2], *words[4:]])
+    assert "Warning" not in capsys.readouterr().err  # it arrives
+
+
 def test_a_seed_draws_nothing_without_spread(short_scene: Scene) -> None:
     start = begin(short_scene, 1)
     assert start.title == "the scene's own, which has no spread to draw from"
