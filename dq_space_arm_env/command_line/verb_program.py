@@ -249,8 +249,8 @@ def _discard_unwritable_output() -> None:
 def program() -> None:
     """A spacecraft with an arm, in dual quaternions: simulate, solve, learn, measure.
 
-    Every verb has its own --help. Exit status: 0 success; 1 the result falls short of what was asked; 2
-    unusable input; 70 a bug; 130 interrupted.
+    Every verb has its own --help. Exit status: 0 success; 1 the result falls short of what was asked, in the
+    ways that the verb's help names; 2 unusable input; 70 a bug; 130 interrupted.
     """
 
 

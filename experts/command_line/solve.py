@@ -60,7 +60,8 @@ def solve(
     """Solve SCENE, a name or a file, by control-limited differential dynamic programming.
 
     The output folder receives solution.npz (trajectory, controls, feedback gains), scene.yaml, summary.json,
-    and figures on request. Exit status 1: the solve did not converge, or misses a catch; 130: interrupted.
+    and figures on request. Exit status 1: the solve did not converge, or misses a catch; 130: interrupted. A
+    target that the optimum misses is no failure: the table, and is_success of --json, tell.
     After the preparation the best trajectory so far is always saved, flagged as not converged.
     """
     from dq_space_arm_env import load_scene

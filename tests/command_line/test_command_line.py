@@ -99,6 +99,14 @@ def test_names_are_those_of_the_packages() -> None:
     assert info_module.package_version() == __version__
 
 
+def test_the_program_leaves_it_to_its_verbs_what_falls_short() -> None:
+    whole, solve = (
+        " ".join(CliRunner().invoke(program, [*path, "--help"]).stdout.split()) for path in ((), ("solve",))
+    )
+    assert "1 the result falls short of what was asked, in the ways that the verb's help names; 2" in whole
+    assert "A target that the optimum misses is no failure" in solve
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_the_shell_gets_its_script(shell: str) -> None:
     result = CliRunner().invoke(program, ["completion", shell])
