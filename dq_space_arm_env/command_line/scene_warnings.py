@@ -35,12 +35,15 @@ _STEP = 1.0  # s
 _FRACTIONS_OF_PI = 6.0, 4.0, 3.0, 2.0, 1.5, 1.0
 _ROUNDED_PI = 0.002  # degrees, within which an angle is such a fraction of pi
 _SPIN = 1.0  # rad/s, of a target: a turn in six seconds
+_EXACT = 1e-9  # of a tolerance, in its unit
 _HALF_TURN = 180.0  # degrees, the largest attitude error
 _NEAR = 2.0  # times a tolerance, of a way to the target
 _ROUNDED = 9  # digits after the point of a distance, m
 _SPEEDS = 0.5, 45.0  # m/s and degrees/s, on the mean way to the target
 _REFUSED = "constraints that name frames refuse it; rename the link"
 _ALIKE = 0.01  # of the radius of gyration and of the inertia, between two descriptions of a body
+_VIOLENT = 50.0  # m/s^2 and rad/s^2, by the limits of what drives the base
+_COARSE = "actions and noise, which are fractions of the limits, mean little"
 _TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the efforts of a swing
 
 
@@ -70,6 +73,13 @@ def _units(scene: Scene) -> Iterator[str]:
         (f"links[{i}].joint.position", f"{length:g} m from {link.name!r} to its parent: millimeters?")
         for i, link in enumerate(scene.links)
         if (length := math.hypot(*link.joint.position)) > _FAR
+    )
+    centers = [(f"links[{i}]", link.center_of_mass) for i, link in enumerate(scene.links)]
+    centers += [("payload", scene.payload.center_of_mass)] if scene.payload is not None else []
+    yield from _together(
+        (f"{place}.center_of_mass", f"{length:g} m from the body's frame: millimeters?")
+        for place, center in centers
+        if (length := math.hypot(*center)) > _FAR
     )
     if math.hypot(*scene.tip.position) > _FAR:
         yield f"tip.position: {math.hypot(*scene.tip.position):g} m from the last joint: millimeters?"
@@ -178,7 +188,8 @@ def _actuators(scene: Scene) -> Iterator[str]:
 
 
 def limit_warnings(scene: Scene) -> Iterator[str]:
-    """Say which torques are out of proportion to what free flight takes."""
+    """Say which forces and torques are out of proportion to what free flight takes."""
+    yield from _base_limits(scene)
     motors = scene.actuators.joint_torque
     if motors is None:
         return
@@ -194,12 +205,31 @@ def limit_warnings(scene: Scene) -> Iterator[str]:
     if strong:
         times, where, effort = max(strong)
         yield (
-            f"torque limits: {_several(where, strong)}, {times:,.0f} times {swing}: actions and noise, which "
-            f"are fractions of the limits, mean little; {3.0 * effort:.2g} would do there"
+            f"torque limits: {_several(where, strong)}, {times:,.0f} times {swing}: {_COARSE}; "
+            f"{3.0 * effort:.2g} would do there"
         )
     if weak:
         times, where, _ = min(weak)
         yield f"torque limits: {_several(where, weak)}, {times:.2g} of {swing}: the arm will crawl"
+
+
+def _base_limits(scene: Scene) -> Iterator[str]:
+    """Forces and torques that throw the base about."""
+    layout, base = StateLayout.of(scene), scene.base
+    largest = float(np.linalg.eigvalsh(np.array(base.inertia))[-1])
+    for name, key, size, unit in (
+        ("base_force", "base_force.limit", base.mass, "m/s^2"),
+        ("base_torque", "base_torque.limit", largest, "rad/s^2"),
+        ("wheel_torque", "wheels", largest, "rad/s^2"),
+        ("thruster_force", "thrusters", base.mass, "m/s^2"),
+    ):
+        entries = getattr(layout.control, name)
+        limits = [limit for limit in layout.control_limit[entries] if math.isfinite(limit)]
+        if limits and (rate := max(limits) / size) > _VIOLENT:
+            yield (
+                f"actuators.{key}: {max(limits):g} {layout.control.unit(entries)} accelerate the base by "
+                f"{rate:.3g} {unit}: {_COARSE}"
+            )
 
 
 def _several(where: str, found: list[tuple[float, str, float]]) -> str:
@@ -238,6 +268,9 @@ def _times(scene: Scene) -> Iterator[str]:
             f"success.attitude_error_deg: {scene.success.attitude_error_deg:g} degrees, half a turn: no "
             "attitude fails"
         )
+    for name, value in scene.success.model_dump().items():
+        if value is not None and value < _EXACT:
+            yield f"success.{name}: {value:g}, as small as what rounding leaves: nothing succeeds"
     tolerance = scene.success.position_error
     if not drifts and scene.target.motion is None and 0.0 < meters < _NEAR * tolerance:
         yield (

@@ -202,6 +202,26 @@ NEAR = {
             r"links\[0\].name: 'tip' is also a frame of every scene: .* the link Likewise links\[2\].name$",
         ),
         ({"links.1.joint.position": [0, 0, 200]}, r"links\[1\].joint.position: 200 m .*: millimeters\?"),
+        (
+            {f"links.{i}.center_of_mass": [500, 0, 0] for i in (0, 2)},
+            r"links\[0\].center_of_mass: 500 m from .*: millimeters\? Likewise links\[2\].center_of_mass$",
+        ),
+        (
+            {"payload": {"mass": 5, "inertia": [1, 1, 1], "center_of_mass": [0, 90, 0]}},
+            r"payload.center_of_mass: 90 m from the body's frame: millimeters\?$",
+        ),
+        (
+            {"actuators.base_torque.limit": 1e9},
+            r"actuators.base_torque.limit: 1e\+09 N m accelerate the base by",
+        ),
+        (
+            {"actuators.base_force.limit": 1e4},
+            r"actuators.base_force.limit: 10000 N accelerate .* 95.2 m/s\^2: act",
+        ),
+        (
+            {"success.position_error": 1e-12},
+            "success.position_error: 1e-12, as small as what rounding leaves",
+        ),
         ({"tip.position": [850, 0, 0]}, r"tip.position: 850 m from the last joint: millimeters\?"),
         ({"initial_state.joint_angles": [-30, 50, -90]}, r"initial_state.joint_angles: -30 rad: degrees\?"),
         ({"initial_state.joint_rates": [0, 90, 0]}, r"initial_state.joint_rates: 90 rad/s: degrees\?"),
