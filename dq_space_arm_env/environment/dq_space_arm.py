@@ -201,7 +201,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     ## Episode End
 
     1. Termination: the scene's number of steps (1000) is reached. The observation holds the time left and the task has a terminal cost, so this is the end of
-       the task, not a truncation.
+       the task, not a truncation. `gymnasium.make(..., max_episode_steps=10)` truncates before the step that carries the terminal cost: shorten `simulation.steps`.
     2. Termination: the simulation diverged (the state is not finite, or its norm exceeds 5e5). `info["diverged"]` is true, and this and the remaining steps are
        charged with a bound of what any motion from there could cost, so ending early never pays.
     3. Termination: a constraint with `terminates: true` is violated by more than its tolerance. The episode is no success, and is charged as after a divergence.
