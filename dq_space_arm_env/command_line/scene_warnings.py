@@ -134,7 +134,7 @@ def _masses(scene: Scene) -> Iterator[str]:
     if scene.base.mass < arm:
         yield (
             f"base.mass: {scene.base.mass:.3g} kg, lighter than the arm of {arm:.3g} kg: is the spacecraft "
-            "missing, or too light? --spacecraft-mass of `scenes import` sets it"
+            "missing, or too light? Of an imported robot --spacecraft-mass of `scenes import` sets it"
         )
     reach = max(min(arm_length(scene), _FAR), 1.0)
     light, wide, dense = [], [], []

@@ -168,6 +168,18 @@ def graph_of(
     )
 
 
+def unknown_operation(function: casadi.Function) -> str | None:
+    """CasADi's name of the first operation of a function without an instruction; None if all have one."""
+    known = {casadi.OP_CONST, casadi.OP_INPUT, casadi.OP_OUTPUT, casadi.OP_HYPOT, *_OPERATION_NAMES}
+    operations = (function.instruction_id(k) for k in range(function.n_instructions()))
+    return next((_casadi_name(each) for each in operations if each not in known), None)
+
+
+def _casadi_name(operation: int) -> str:
+    names = (key for key, value in vars(casadi).items() if key[:3] == "OP_" and value == operation)
+    return next(names, str(operation))
+
+
 def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ...], list[int]]:
     """Turn CasADi's instructions on a reused work vector into nodes written once.
 
@@ -200,9 +212,8 @@ def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ..
         elif operation in _OPERATION_NAMES:
             register[writes[0]] = add(Node(_OPERATION_NAMES[operation], tuple(register[r] for r in reads)))
         else:
-            names = (key for key, value in vars(casadi).items() if key[:3] == "OP_" and value == operation)
             raise NotImplementedError(
-                f"graph {function.name()!r} holds CasADi operation {next(names, operation)}, "
+                f"graph {function.name()!r} holds CasADi operation {_casadi_name(operation)}, "
                 "which the emitter has no instruction for"
             )
     return tuple(nodes), results

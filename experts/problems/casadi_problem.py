@@ -6,6 +6,7 @@ import casadi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dq_space_arm_env.compiler.graph import unknown_operation
 from experts.problems.euclidean_problem import EuclideanProblem, Function, Matrix, compiled
 from experts.problems.shooting_problem import Kernel
 
@@ -56,6 +57,7 @@ class CasadiProblem(EuclideanProblem):
             TypeError: If a function returns something other than CasADi's expressions or numbers.
             ValueError: If sizes, bounds or numbers contradict each other, a function returns another size, or
                 an expression holds symbols that are not among its arguments.
+            NotImplementedError: If an expression holds an operation that does not compile, such as `erf`.
         """
         bounds = control_lower, control_upper
         super().__init__(initial_state, n_controls, horizon, time_step, bounds, parameters)
@@ -148,10 +150,15 @@ def _expression(name: str, function: Function, arguments: tuple[Matrix, ...], si
             "a scalar" if size == 1 and name != "step" else f"{size} numbers, one for each of initial_state"
         )
         raise ValueError(f"{name} returns an expression of shape {column.shape}; expected {wanted}")
-    free = casadi.Function(name, list(arguments), [column], {"allow_free": True}).free_sx()
-    if free:
+    traced = casadi.Function(name, list(arguments), [column], {"allow_free": True})
+    if free := traced.free_sx():
         raise ValueError(
             f"{name} holds the symbols {', '.join(map(str, free))}, which are not among its "
             "arguments; give numbers, or `parameters`"
+        )
+    if (operation := unknown_operation(traced)) is not None:
+        raise NotImplementedError(
+            f"{name} holds CasADi's {operation}, which does not compile: write it by other functions, or use "
+            "PythonProblem"
         )
     return column

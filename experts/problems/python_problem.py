@@ -13,6 +13,15 @@ from experts.problems.differences import hessian, jacobian
 from experts.problems.euclidean_problem import EuclideanProblem, Function
 from experts.problems.shooting_problem import FloatArray, Kernel
 
+_GIVEN = {
+    "step_with_cost: x_next": "step",
+    "step_with_cost: cost": "stage_cost",
+    "terminal_cost: cost": "terminal_cost",
+    "cost_derivatives": "stage_cost_derivatives",
+    "terminal_cost_hessian": "terminal_cost_derivatives",
+}
+"""Functions of the user behind kernels and their results, where they have other names."""
+
 
 class PythonProblem(EuclideanProblem):
     """A `ShootingProblem` of functions: minimize sum_k stage_cost(x_k, u_k) + terminal_cost(x_N).
@@ -166,11 +175,15 @@ class PythonProblem(EuclideanProblem):
         lower, upper = (np.atleast_2d(bound)[0] for bound in (self.control_lower, self.control_upper))
         p = [self.parameters.nominal] if self.parameters.inputs else []
         given = [self.initial_state, *p, np.clip(np.zeros(self.n_controls), lower, upper), self.initial_state]
-        for name, (function, inputs, outputs) in self._table().items():
+        for kernel, (function, inputs, outputs) in self._table().items():
             results = function(*(read_only(value) for value in given[: len(inputs)]))
             if len(results) != len(outputs):
-                raise ValueError(f"{name} has {len(results)} results; expected {', '.join(outputs)}")
+                raise ValueError(
+                    f"{_GIVEN.get(kernel, kernel)} has {len(results)} results; expected {', '.join(outputs)}"
+                )
             for (result, shape), value in zip(outputs.items(), results, strict=True):
-                found = real_array(f"{name}: {result}", value, np.float64).shape
+                name = _GIVEN.get(f"{kernel}: {result}") or f"{_GIVEN.get(kernel, kernel)}: {result}"
+                found = real_array(name, value, np.float64).shape
                 if found != shape:
-                    raise ValueError(f"{name}: {result} has shape {found}; expected {shape}")
+                    wanted = f"{shape}" if shape else "(), a single number, such as u[0] ** 2"
+                    raise ValueError(f"{name} has shape {found}; expected {wanted}")

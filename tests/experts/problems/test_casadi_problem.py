@@ -231,6 +231,11 @@ def test_parameters_may_differ_from_stage_to_stage():
         ({"terminal_cost": lambda x, p: None}, TypeError, "terminal_cost returns NoneType"),
         ({"terminal_cost": lambda x, p: casadi.MX.sym("m")}, TypeError, "terminal_cost returns MX"),
         ({"stage_cost": lambda x, u, p: casadi.SX.sym("mass")}, ValueError, "the symbols mass, which"),
+        (
+            {"terminal_cost": lambda x, p: casadi.erf(x[0])},
+            NotImplementedError,
+            "terminal_cost holds CasADi's OP_ERF, which does not compile: .*, or use PythonProblem",
+        ),
         ({"initial_state": [[1.0, 2.0]]}, ValueError, r"initial_state has shape \(1, 2\)"),
         ({"initial_state": [1.0, np.nan]}, ValueError, r"initial_state\[1\] is nan"),
         ({"parameters": [0.7, np.inf]}, ValueError, r"parameters\[1\] is inf"),

@@ -261,13 +261,21 @@ def test_numbers_that_are_not_finite_end_the_solve_and_the_function_is_named(cha
 @pytest.mark.parametrize(
     ("changes", "error", "sentence"),
     [
-        ({"step": lambda x, u, p: x[0]}, ValueError, r"x_next has shape \(\); expected \(2,\)"),
-        ({"stage_cost": lambda x, u, p: u}, ValueError, r"cost has shape \(1,\); expected \(\)"),
-        ({"terminal_cost": lambda x, p: "1"}, TypeError, "terminal_cost: cost: of type"),
-        ({"terminal_cost": lambda x, p: 1j}, TypeError, "terminal_cost: cost: of type complex128"),
+        ({"step": lambda x, u, p: x[0]}, ValueError, r"^step has shape \(\); expected \(2,\)"),
+        (
+            {"stage_cost": lambda x, u, p: u**2},
+            ValueError,
+            r"^stage_cost has shape \(1,\); expected \(\), a single number, such as u\[0\] \*\* 2",
+        ),
+        ({"terminal_cost": lambda x, p: "1"}, TypeError, "^terminal_cost: of type"),
+        ({"terminal_cost": lambda x, p: 1j}, TypeError, "^terminal_cost: of type complex128"),
         ({"linearize": lambda x, u, p: (np.eye(2), np.ones(2))}, ValueError, r"B has shape \(2,\); expected"),
         ({"linearize": lambda x, u, p: (np.eye(2),)}, ValueError, "linearize has 1 results; expected A, B"),
-        ({"terminal_cost_derivatives": lambda x, p: (x, x)}, ValueError, r"lxx has shape \(2,\)"),
+        (
+            {"terminal_cost_derivatives": lambda x, p: (x, x)},
+            ValueError,
+            r"derivatives: lxx has shape \(2,\)",
+        ),
         ({"stage_cost_derivatives": lambda x, u, p: (x, u)}, ValueError, "not enough values"),
         ({"control_upper": -6.0}, ValueError, "the lower one must not exceed the upper one"),
         ({"initial_state": []}, ValueError, "n_states is 0"),
