@@ -61,7 +61,8 @@ def announce(what: str, *, if_first: bool = False) -> None:
         return
     _announced.add(what)
     _logger().info(
-        "compiling %s for its first use, mostly under a minute on free cores; the result is kept in %s",
+        "compiling what is used of %s for the first time, mostly under a minute on free cores; the result is "
+        "kept in %s",
         what,
         cache_directory(),
     )

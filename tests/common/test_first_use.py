@@ -114,4 +114,7 @@ def test_there_is_one_message_for_a_scene_and_its_solver(terminal: Terminal) -> 
             first_use.announce("scene 'paper'")
             first_use.announce("the solver", if_first=True)
     assert terminal.getvalue().count("\n") == 1
-    assert "compiling scene 'paper' for its first use, mostly under a minute" in terminal.getvalue()
+    assert (
+        "compiling what is used of scene 'paper' for the first time, mostly under a minute"
+        in terminal.getvalue()
+    )

@@ -324,7 +324,7 @@ def test_code_that_was_removed_is_compiled_again_where_scenes_refer_to_it(cache,
 def test_a_first_use_says_that_it_compiles_and_where_the_result_is(cache):
     code = SECOND_PROCESS + "kernels.linearize(kernels.layout.initial_state, [0.0] * kernels.n_u)\n"
     first, second = (run_process(cache, code).stderr for _ in range(2))
-    assert "compiling scene 'planar' for its first use" in first
+    assert "compiling what is used of scene 'planar' for the first time" in first
     assert str(cache) in first
     assert second == ""
 

@@ -45,7 +45,7 @@ def test_a_user_gets_every_file_and_the_right_numbers(scene_file: Path) -> None:
     folder = scene_file.parent
     result = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
     assert result.returncode == 0, result.stderr
-    compiling = "dq_space_arm_env: compiling scene 'short'"  # only where the cache does not know it yet
+    compiling = "dq_space_arm_env: compiling what is used of scene 'short'"  # what the cache lacks
     assert all(line.startswith(compiling) for line in result.stderr.splitlines())
     out = folder / "results" / "short"
     assert names(out) == DATA | FIGURES
