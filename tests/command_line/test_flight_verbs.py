@@ -69,6 +69,7 @@ def test_solve_writes_what_it_says(solved: Path, scene: Scene) -> None:
     assert info["position_error"] == pytest.approx(summary["final_position_error_m"])
 
 
+@pytest.mark.slow
 def test_a_solve_that_misses_says_what_is_unwise_in_the_scene(
     scene_file: str, short_scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
