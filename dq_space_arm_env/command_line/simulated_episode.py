@@ -65,7 +65,7 @@ def begin(scene: Scene, seed: int | None = None, given: str | NDArray[np.float64
     if seed is not None:
         env.reset(seed=seed)
         drawn = any(scene.spread.model_dump().values())
-        title = f"drawn with seed {seed}" if drawn else f"{OWN}, which has no spread to draw from"
+        title = f"drawn with seed {seed}" if drawn else f"{OWN} (no spread)"
     else:
         state = read_state(given, env.kernels.n_x) if isinstance(given, str) else given
         try:

@@ -87,7 +87,7 @@ def test_a_solve_that_misses_says_what_is_unwise_in_the_scene(
 
 def test_a_seed_draws_nothing_without_spread(short_scene: Scene) -> None:
     start = begin(short_scene, 1)
-    assert start.title == "the scene's own, which has no spread to draw from"
+    assert start.title == "the scene's own (no spread)"
     assert start.state.tolist() == begin(short_scene).state.tolist()
     moved = short_scene.replace(spread={"target_position": 0.1})
     assert begin(moved, 1).title == "drawn with seed 1"
