@@ -53,7 +53,6 @@ def _text(value: Value) -> str:
 def _result_rows(run: ManeuverRun) -> Iterable[tuple[str, str, str]]:
     solution, maneuver, replay, success = run.solution, run.maneuver, run.replay, run.scene.success
     terms = run.cost_terms
-    start, end = math.degrees(maneuver.angle[0]), math.degrees(maneuver.angle[-1])
     yield "cost J", f"{solution.cost:.6f}", f"doing nothing costs {run.zero_control_cost:.6g}"
     yield "  tip pose", f"{terms['cost_pose']:.6f}", f"at T {terms['terminal_cost_pose']:.2e}"
     velocity = terms["terminal_cost_base_velocity"]
@@ -70,13 +69,21 @@ def _result_rows(run: ManeuverRun) -> Iterable[tuple[str, str, str]]:
         str(solution.iterations),
         f"in {seconds}, after {run.preparation_seconds:.1f} s of preparation",
     )
-    tolerance = f"tolerance {success.attitude_error_deg:g}°, {success.position_error:g} m"
-    yield "attitude error", f"{start:.3g}° → {end:.3g}°", tolerance
-    within = end <= success.attitude_error_deg and maneuver.distance[-1] <= success.position_error
-    reached = "within the tolerance" if within else "NOT within the tolerance"
-    if within and not replay.is_success[0]:
-        reached += ", but NO success: a velocity is not, or a catch has failed"
-    yield "position error", f"{maneuver.distance[0]:.3g} m → {maneuver.distance[-1]:.3g} m", reached
+    errors = (
+        (
+            "attitude error",
+            [math.degrees(angle) for angle in maneuver.angle],
+            success.attitude_error_deg,
+            "°",
+        ),
+        ("position error", maneuver.distance, success.position_error, " m"),
+    )
+    for name, path, most, unit in errors:
+        verdict = "within" if path[-1] <= most else "NOT within"
+        reached = f"{verdict} the tolerance of {most:g}{unit}"
+        yield name, f"{path[0]:.3g}{unit} → {path[-1]:.3g}{unit}", reached
+    if all(path[-1] <= most for _, path, most, _ in errors) and not replay.is_success[0]:
+        yield "success", "NO", "a velocity is not within its tolerance, or a catch has failed"
     if run.finer_errors is None:
         yield "the same plan, RK4, Δt/4", "-", "delays of actuators are whole steps"
     else:

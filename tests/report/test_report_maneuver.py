@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -199,12 +200,20 @@ def test_finer_steps_show_the_worst_of_several_tips(short_scene: Scene) -> None:
     assert distance == pytest.approx(3.0, abs=1e-9)
 
 
-def test_a_pose_within_the_tolerances_may_be_no_success(short_run: ManeuverRun) -> None:
-    for flown, sentence in ((True, "within the tolerance "), (False, "within the tolerance, but NO success")):
-        run = replace(short_run, replay=replace(short_run.replay, is_success=np.array([flown])))
+def test_each_error_has_its_own_verdict_and_a_pose_within_may_be_no_success(short_run: ManeuverRun) -> None:
+    exact = short_run.scene.replace(success={"position_error": 1e-12})
+    for scene, flown, verdict in (
+        (short_run.scene, True, "within"),
+        (short_run.scene, False, "within"),
+        (exact, False, "NOT within"),
+    ):
+        replayed = replace(short_run.replay, is_success=np.array([flown]))
         console = Console(width=200, record=True, file=io.StringIO())
-        print_tables(console, run)
-        assert f" {sentence}" in console.export_text()
+        print_tables(console, replace(short_run, scene=scene, replay=replayed))
+        text = console.export_text()
+        assert re.search("attitude error .*° +within the tolerance of 3°", text)
+        assert re.search(f"position error .* m +{verdict} the tolerance of", text)
+        assert bool(re.search("success +NO ", text)) == (verdict == "within" and not flown)
 
 
 def test_zero_controls_cost_is_that_of_staying(short_run: ManeuverRun) -> None:
