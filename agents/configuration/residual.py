@@ -1,16 +1,17 @@
 """Configuration of an agent that learns to correct plans under model mismatch."""
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from agents.configuration.algorithms import PPO, SAC
+from agents.configuration.algorithms import PPO, SAC, Demonstrated, Hindsight, Lagrangian
 from agents.configuration.reinforcement import ActionScale, Configuration, Practice, Schedule
 from agents.configuration.schema import AgentConfiguration, DemonstrationSource, Many, Mismatch
 from dq_space_arm_env.validation import Model, Positive, Problem
 
 PREFIX = "residual-"
+_REFUSED: Any = Field(default=None, exclude=True, description="refused: corrections are learned without it")
 
 
 class ResidualPractice(Model):
@@ -47,12 +48,15 @@ class ResidualPPO(PPO):
     """Proximal policy optimization of a correction."""
 
     name: Literal["residual-PPO"]  # type: ignore[assignment]
+    lagrangian: Lagrangian | None = _REFUSED
 
 
 class ResidualSAC(SAC):
     """Soft actor-critic for a correction."""
 
     name: Literal["residual-SAC"]  # type: ignore[assignment]
+    hindsight: Hindsight | None = _REFUSED
+    demonstrations: Demonstrated | None = _REFUSED
 
 
 class ResidualConfiguration(AgentConfiguration):
@@ -80,8 +84,8 @@ class ResidualConfiguration(AgentConfiguration):
             )
         if isinstance(self.algorithm, PPO):
             yield from self.algorithm.batch_problems(copies)
-        for name in ("hindsight", "demonstrations", "lagrangian"):
-            if getattr(self.algorithm, name, None) is not None:
+        for name, field in type(self.algorithm).model_fields.items():
+            if field.exclude and getattr(self.algorithm, name) is not None:
                 yield Problem(
                     ("algorithm", name), "given", "must be left out: corrections are learned without it"
                 )

@@ -30,10 +30,15 @@ def models_of(model: type[BaseModel]) -> list[type[BaseModel]]:
         The models.
     """
     found = [model]
-    for field in model.model_fields.values():
+    for field in _fields(model).values():
         for inner in _models_in(field.annotation):
             found += [each for each in models_of(inner) if each not in found]
     return found
+
+
+def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """Fields by name, but for those that files must leave out."""
+    return {name: field for name, field in model.model_fields.items() if not field.exclude}
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -107,7 +112,7 @@ def _paths(model: type[BaseModel]) -> dict[type[BaseModel], str]:
     paths = {model: "Top level"}
 
     def walk(outer: type[BaseModel], prefix: str) -> None:
-        for name, field in outer.model_fields.items():
+        for name, field in _fields(outer).items():
             dots = "[]" if _is_list(field.annotation) else ""
             for inner in _models_in(field.annotation):
                 if inner not in paths:
@@ -130,7 +135,7 @@ def _section(heading: str, text: str, rows: list[str]) -> str:
 def _rows(model: type[BaseModel]) -> list[str]:
     """The rows of its table: all keys but the one that its heading has."""
     rows = []
-    for name, field in model.model_fields.items():
+    for name, field in _fields(model).items():
         if (name, field) != _chooser(model):
             cells = (f"`{name}`", _text(field.description or ""), kind_of(field), default_of(field))
             rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
