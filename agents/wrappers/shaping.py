@@ -138,11 +138,12 @@ class Shaping(NamedTuple):
             )
         return cls(scale, power, success_reward, end_error_cost, tolerances)
 
-    def steps_left(self, env: Any) -> NDArray[np.float64] | None:
+    def steps_left(self, env: Any) -> int | NDArray[np.int64] | None:
         """Time steps that the episodes of an environment still have; None where nothing depends on them."""
         if self.power == 1.0 or not isinstance(scene := getattr(env, "scene", None), Scene):
             return None
-        return np.asarray(scene.simulation.steps - env.get_state()["memory"][..., 0], dtype=np.float64)
+        left: int | NDArray[np.int64] = scene.simulation.steps - env.elapsed_steps
+        return left
 
     def of_steps(self, rewards: ArrayLike, steps: ArrayLike) -> NDArray[np.float32]:
         """Power and scale of rewards, shape (B,), of so many time steps each."""

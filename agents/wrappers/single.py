@@ -8,7 +8,7 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from agents.wrappers.shaping import (
     HeldReward,
@@ -172,7 +172,7 @@ class ShapeReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         left = self._shaping.steps_left(self.env.unwrapped)
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.unshaped = float(reward)
-        steps: Any = _steps_taken(self.env)[0]
+        steps: int | NDArray[np.int64] = _steps_taken(self.env)[0]
         if left is not None and (terminated or info.get("diverged", False)):
             steps = left
         shaped = self._shaping.of_steps([self.unshaped], steps)

@@ -368,6 +368,12 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         return present
 
     @property
+    def elapsed_steps(self) -> int:
+        """Time steps that this episode has taken. `ResetNeeded` before the first reset."""
+        self._require_reset("reading the elapsed steps")
+        return int(self._memory[0])
+
+    @property
     def episode_scene(self) -> Scene:
         """The scene with the parameters of this episode as constants, without a spread. `ResetNeeded` before the first reset."""
         self._require_reset("asking for the episode's scene")

@@ -197,6 +197,11 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
         return self._env.parameters
 
     @property
+    def elapsed_steps(self) -> int:
+        """Time steps that this episode has taken, see `DQSpaceArmEnv.elapsed_steps`."""
+        return self._env.elapsed_steps
+
+    @property
     def episode_scene(self) -> Scene:
         """The scene of this episode, see `DQSpaceArmEnv.episode_scene`."""
         return self._env.episode_scene

@@ -191,6 +191,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         self._require_reset("reading the parameters")
         return self._envs.stage_parameters()
 
+    @property
+    def elapsed_steps(self) -> NDArray[np.int64]:
+        """Time steps that each episode has taken, shape (num_envs,). `ResetNeeded` before the first reset."""
+        self._require_reset("reading the elapsed steps")
+        return self._envs.kept()["memory"][:, 0].astype(np.int64)
+
     def _require_reset(self, what: str) -> None:
         if not self._begun:
             raise ResetNeeded(f"the episodes have not begun: call reset() before {what}")
@@ -224,7 +230,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
                 self._remember(self.observe())
             self._over = np.setdiff1d(self._over, rows)
             self._begin_trails(rows)
-            self._extend_trails(np.arange(self.num_envs) if first else rows)
+            self._extend_trails(None if first else rows)
         else:
             seeds = self._checked_seeds(seed)  # if one is refused, nothing has changed
             self.set_state(self._given_state(saved, rows), rows)
@@ -348,7 +354,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             else:
                 self._over = rows
         self._remember(result.observation)
-        self._extend_trails(np.arange(self.num_envs))
+        self._extend_trails()
         info = self._info(result, self._all) | final
         if len(begun):
             info |= self._drawn(begun)
@@ -504,9 +510,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         if self._payloads is not None:
             self._payloads.adrift[rows] = np.nan
 
-    def _extend_trails(self, rows: Rows) -> None:
-        """Keep what later pictures show of the present in some episodes, and where payloads are let go."""
+    def _extend_trails(self, rows: Rows | None = None) -> None:
+        """Keep what later pictures show of some episodes, or all, and where payloads are let go."""
         if self._trails is not None:
+            rows = np.arange(self.num_envs) if rows is None else rows
             tips = self.kernels.tip_pose(self._envs.x[rows])
             self._trails.extend(rows, np.array(poses.position(tips.T)).T)
         if self._payloads is not None:

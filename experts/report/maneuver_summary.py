@@ -69,20 +69,15 @@ def _result_rows(run: ManeuverRun) -> Iterable[tuple[str, str, str]]:
         str(solution.iterations),
         f"in {seconds}, after {run.preparation_seconds:.1f} s of preparation",
     )
+    first, last = (math.degrees(maneuver.angle[k]) for k in (0, -1))
     errors = (
-        (
-            "attitude error",
-            [math.degrees(angle) for angle in maneuver.angle],
-            success.attitude_error_deg,
-            "°",
-        ),
-        ("position error", maneuver.distance, success.position_error, " m"),
+        ("attitude error", first, last, success.attitude_error_deg, "°"),
+        ("position error", maneuver.distance[0], maneuver.distance[-1], success.position_error, " m"),
     )
-    for name, path, most, unit in errors:
-        verdict = "within" if path[-1] <= most else "NOT within"
-        reached = f"{verdict} the tolerance of {most:g}{unit}"
-        yield name, f"{path[0]:.3g}{unit} → {path[-1]:.3g}{unit}", reached
-    if all(path[-1] <= most for _, path, most, _ in errors) and not replay.is_success[0]:
+    for name, start, end, most, unit in errors:
+        verdict = "within" if end <= most else "NOT within"
+        yield name, f"{start:.3g}{unit} → {end:.3g}{unit}", f"{verdict} the tolerance of {most:g}{unit}"
+    if all(end <= most for _, _, end, most, _ in errors) and not replay.is_success[0]:
         yield "success", "NO", "a velocity is not within its tolerance, or a catch has failed"
     if run.finer_errors is None:
         yield "the same plan, RK4, Δt/4", "-", "delays of actuators are whole steps"

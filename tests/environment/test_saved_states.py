@@ -120,6 +120,21 @@ def test_reset_goes_on_with_a_state(kind):
     assert_same(other.reset(), gymnasium.make(kind, scene=DRAWN).reset(seed=7))
 
 
+@pytest.mark.parametrize("kind", [DQSpaceArmEnv, DQSpaceArmGoalEnv])
+def test_elapsed_steps_are_those_since_the_reset(kind):
+    vector = {DQSpaceArmEnv: DQSpaceArmVectorEnv, DQSpaceArmGoalEnv: DQSpaceArmGoalVectorEnv}[kind]
+    env, venv = kind(DRAWN), vector(2, DRAWN, autoreset_mode="Disabled")
+    for each in (env, venv):
+        with pytest.raises(ResetNeeded):
+            _ = each.elapsed_steps
+        each.reset(seed=1)
+        for _ in range(3):
+            each.step(np.zeros(each.action_space.shape))
+    assert env.elapsed_steps == 3
+    venv.reset(options={"reset_mask": np.array([False, True])})
+    assert venv.elapsed_steps.tolist() == [3, 0]
+
+
 def test_a_copy_of_a_goal_environment_saves_the_generator_that_it_draws_from():
     env = DQSpaceArmGoalEnv(DRAWN)
     env.reset(seed=1)
